@@ -7,6 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 __all__ = [
+    "ARMIJO",
     "BLOCK",
     "DIFFERENCE",
     "EQUAL",
@@ -37,6 +38,8 @@ HALF_DIGITS = float(np.sqrt(np.finfo(float).eps))
 DIFFERENCE = float(np.cbrt(np.finfo(float).eps))
 #: Relative residual of linear equations that are solved as well as by a factor, by iterations.
 SOLVED = 1e-10
+#: Share of the fall that a slope promises which a step must have (Armijo's rule).
+ARMIJO = 1e-4
 #: Most iterations for one number at a point, or one vector: more than any takes.
 LOCAL_ITERATIONS = 100
 #: Most points or domains that are looked at together, so that what is known of them stays in the

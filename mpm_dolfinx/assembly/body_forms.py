@@ -24,15 +24,13 @@ from ..errors import MPMError
 from ..meshes.quadrature import nodal_forces, with_hoop
 from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
+from ..tolerances import BLOCK
 from .low_rank import LowRankTangent
 from .petsc import assemble_into, assemble_matrix, create_vector, load_quotient
 from .rules import couples_cells, depends_on, follows, form_of_rank, is_zero, split_by_rule
 from .volume_ratio import average_in
 
 __all__ = ["BodyForms", "PointStress", "integrals_of", "no_values"]
-
-#: Parts of a body's domains whose forces are held apart at a time.
-PIECES = 16
 
 no_values: NDArray[np.float64] = np.zeros(0)
 
@@ -415,8 +413,8 @@ class BodyForms:
         with total.localForm() as local:
             local.set(0.0)
             count = local.getLocalSize() // gdim
-            ends = np.linspace(0, n, PIECES + 1).astype(int)
-            for part in map(slice, ends[:-1], ends[1:]):
+            for first in range(0, n, BLOCK):
+                part = slice(first, first + BLOCK)
                 own = np.abs(external[part] + self._internal_forces(part))
                 nodes = domain_nodes[part].ravel()
                 for i in range(gdim):

@@ -15,10 +15,11 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConvergenceError, MPMError
+from ..errors import ConvergenceError
 from ..meshes.quadrature import DomainQuadrature, exact_degree
 from ..parallel.conjugate_gradients import conjugate_gradients
 from ..parallel.totals import over_ranks
+from ..particles.particles import require_shared_nodes
 from .strain import Strain
 
 __all__ = ["GradientAverage"]
@@ -43,11 +44,7 @@ class GradientAverage:
 
     def __init__(self, strain: Strain, length: float, counts: NDArray[np.bool_]) -> None:
         body = strain.particles
-        if not body.shares_nodes:
-            raise MPMError(
-                "length= averages over neighbours, but these domains share no nodes with them; "
-                "make the body of one mesh."
-            )
+        require_shared_nodes("length=", body)
         self._strain, self._body, self.length, self._counts = strain, body, length, counts
         self._comm: MPI.Comm = body.mesh.comm
         index_map = body.W.dofmap.index_map

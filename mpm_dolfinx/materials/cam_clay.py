@@ -20,9 +20,6 @@ __all__ = ["ModifiedCamClay"]
 
 Array = NDArray[np.float64]
 
-#: Newton steps before the bounded search.
-STEPS = 40
-
 
 class ModifiedCamClay(CompiledMaterial):
     """Modified Cam clay at finite strain, with a hyperelastic law and logarithmic hardening.

@@ -16,6 +16,7 @@ from dolfinx import mesh
 
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
+from ..parallel.given import require_whole
 from ..reals import as_reals
 from ..tolerances import EQUAL
 
@@ -25,8 +26,8 @@ type Array = NDArray[np.float64]
 
 #: Ratio of a cell's length to that of the one before, where they grow.
 GROWTH = 1.2
-#: Most cells along an axis, and most halvings: more is a mistake in units.
-MOST, DEEPEST = 1_000_000, 20
+#: Most cells along an axis: more is a mistake in units.
+MOST = 1_000_000
 #: Cells in the plane and in space, the first by default.
 CELLS = (
     (mesh.CellType.quadrilateral, mesh.CellType.triangle),
@@ -80,8 +81,7 @@ def grid_lines(
         )
     if (stop - start) / size > MOST:
         raise MPMError(f"size={size:g} makes more than {MOST} cells of {stop - start:g}.")
-    if isinstance(halvings, bool) or halvings not in range(DEEPEST + 1):
-        raise MPMError(f"halvings= is a whole number from 0 to {DEEPEST}, not {halvings!r}.")
+    require_whole("halvings", halvings, MOST)
     if ((places < start) | (places > stop)).any():
         raise MPMError(f"finer_at={finer_at} is not between {start:g} and {stop:g}.")
     count = max(1, round((ends[1] - ends[0]) / size))

@@ -41,7 +41,7 @@ from .placement import Mover, Placement
 from .response import MaterialDomains
 from .undeformed import Undeformed
 
-__all__ = ["LoadFactor", "Particles"]
+__all__ = ["LoadFactor", "Particles", "require_shared_nodes"]
 
 
 class LoadFactor(fem.Constant):
@@ -480,6 +480,20 @@ class Particles(MaterialDomains):
         elif self.deletion is None:
             self.deletion = Deletion(self.mesh, self.W)
         self.placement.deletion = self.deletion
+
+
+def require_shared_nodes(what: str, body: Any) -> None:
+    """Raise an error unless a body is one whose domains share their nodes.
+
+    Args:
+        what: What needs it.
+        body: What is given for the body.
+    """
+    if not isinstance(body, Particles) or not body.shares_nodes:
+        raise MPMError(
+            f"{what} needs mpm.Particles whose domains share their nodes: of method='cpdi2', made "
+            "of one mesh, or finite elements."
+        )
 
 
 def _is_auto(free: Any) -> bool:

@@ -119,11 +119,8 @@ class Setup:
         """
         for body in self.bodies:
             body.require_movable()
-        if self.supports:
-            raise MPMError("supports= lie on the present body mesh, so the particles cannot move.")
-        for term in self.terms:
-            if not term.movable:
-                raise MPMError(
-                    f"A {type(term).__name__} lives on the present body mesh, so the particles "
-                    "cannot move."
-                )
+        for one in (*self.supports, *(term for term in self.terms if not term.movable)):
+            raise MPMError(
+                f"A {type(one).__name__} lives on the present body mesh, so the particles cannot "
+                "move."
+            )

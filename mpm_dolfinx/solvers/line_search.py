@@ -14,14 +14,13 @@ import numpy as np
 from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import norm, unit_sized
+from ..tolerances import ARMIJO
 
 __all__ = ["LineSearch", "Rules", "stalled"]
 
 #: Most halvings of a Newton step, and the drop in work that needs none.
 HALVINGS = 8
 SUFFICIENT = 0.8
-#: Least share by which the norm falls where it alone is searched on.
-LEAST = 1e-4
 #: Share of its start that the work may keep where points yield, and most evaluations that look
 #: for such a step.
 SHARP = 0.3
@@ -209,7 +208,7 @@ class LineSearch:
         if step.reversed:
             return size <= FOLD * step.norm
         if self._rules.by_norm:
-            return size <= (1.0 - LEAST) * step.norm
+            return size <= (1.0 - ARMIJO) * step.norm
         tells = step.work > 0.0 or self._rules.potential or not self._rules.works
         falls = tells and abs(F.dot(step.direction)) <= SUFFICIENT * abs(step.work)
         return bool(falls or size <= step.norm)

@@ -18,12 +18,13 @@ from ..background.basis import PointBasis
 from ..background.pairs import CellPairs
 from ..meshes.quadrature import volume_ratio
 from ..particles.particles import Particles
+from ..tolerances import SMALL
 
 __all__ = ["CellFill", "poorly_filled"]
 
 #: Fill of a cell below which its dofs count as badly supported, but for round-off: bodies whose
 #: domains are half as wide as a cell fill halves of cells.
-FILL, SAME = 0.5, 1e-7
+FILL = 0.5
 
 
 def poorly_filled(fill: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -32,7 +33,7 @@ def poorly_filled(fill: NDArray[np.float64]) -> NDArray[np.bool_]:
     Args:
         fill: Of each body, shape ``(c, bodies)``.
     """
-    return np.asarray(fill.sum(axis=1) < FILL - SAME)
+    return np.asarray(fill.sum(axis=1) < FILL - SMALL)
 
 
 def _points(body: Particles) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -23,7 +23,7 @@ from ..errors import MPMError, agree
 from ..io.series import Drawing, drawing
 from ..io.snapshot import Kept, Taken
 from ..parallel.given import require_same, require_whole
-from ..particles.particles import Particles
+from ..particles.particles import Particles, require_shared_nodes
 from ..system.own import OwnUnknowns
 from ..system.term import PointMaterial, Term
 from .bond import Bond, Grip, Skin
@@ -411,8 +411,7 @@ def _as_bodies(bodies: Any, what: str) -> list[Particles]:
     """Return the bodies that a structure lies in."""
     every: list[Any] = list(bodies) if isinstance(bodies, list | tuple) else [bodies]
     for body in every:
-        if not isinstance(body, Particles) or not body.shares_nodes:
-            raise MPMError(f"A {what} needs bodies of mpm.Particles with method='cpdi2'.")
+        require_shared_nodes(f"A {what}", body)
     if not every or len({id(body) for body in every}) < len(every):
         raise MPMError(f"A {what} needs one body or several that differ.")
     return every

@@ -22,7 +22,7 @@ from ..background.basis import BackgroundBasis
 from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.given import as_positive, require_whole
-from ..particles.particles import Particles
+from ..particles.particles import Particles, require_shared_nodes
 from ..tolerances import NEGLIGIBLE
 from .term import Term
 
@@ -101,8 +101,7 @@ class Tie(Term):
         axisymmetric: bool = False,
     ) -> None:
         for body in (a, b):
-            if not isinstance(body, Particles) or not body.shares_nodes:
-                raise MPMError("A Tie needs two bodies of mpm.Particles with method='cpdi2'.")
+            require_shared_nodes("A Tie", body)
         if a is b:
             raise MPMError("A Tie needs two bodies, not the same one twice.")
         self.stiffness = as_positive(stiffness, "The stiffness of a Tie")

@@ -25,19 +25,13 @@ from ..parallel.given import is_number
 from ..parallel.totals import over_ranks
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
-from ..tolerances import SOLVED
+from ..tolerances import ARMIJO, LOCAL_ITERATIONS, SOLVED
 from .term import PointMaterial, Term
 
 __all__ = ["FieldEquation"]
 
 type Bound = float | fem.Function | str | None
 """A number, a Function on the field's W, ``"previous"``, or none."""
-
-#: Solves after which a solution is given up.
-MOST = 200
-#: Times that a step is halved, and which share of the fall of energy that its slope promises it
-#: must have.
-HALVINGS, ENOUGH = 20, 1e-4
 
 
 class FieldEquation(Term):
@@ -145,7 +139,7 @@ class FieldEquation(Term):
         lower, upper = self._bounds()
         p.array[:own] = np.clip(p.array[:own], lower, upper)
         p.scatter_forward()
-        for solves in range(MOST):
+        for solves in range(LOCAL_ITERATIONS):
             (residual,) = self._forms.assemble_residuals()
             matrix = self._forms.assemble_tangents()[1, 1]
             diagonal = matrix.getDiagonal().array_r
@@ -165,7 +159,8 @@ class FieldEquation(Term):
             p.array[:own] = self._projected(matrix, slope, values, step, (lower, upper))
             p.scatter_forward()
         raise ConvergenceError(
-            f"The equation of the field '{self.field.name}' was not solved in {MOST} solves"
+            f"The equation of the field '{self.field.name}' was not solved in "
+            f"{LOCAL_ITERATIONS} solves"
         )
 
     def _projected(
@@ -187,14 +182,14 @@ class FieldEquation(Term):
         """
         change, force = matrix.createVecs()
         part = 1.0
-        for _ in range(HALVINGS):
+        for _ in range(LOCAL_ITERATIONS):
             new = np.clip(values + part * step, *bounds)
             change.array_w[:] = new - values
             matrix.mult(change, force)
             falls = float(slope @ change.array_r)
             rest = 0.5 * float(change.array_r @ force.array_r)
             falls, rest = (over_ranks(self._comm, one) for one in (falls, rest))
-            if falls + rest <= ENOUGH * falls:
+            if falls + rest <= ARMIJO * falls:
                 break
             part *= 0.5
         return np.asarray(new)

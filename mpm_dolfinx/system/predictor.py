@@ -12,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..assembly.petsc import absolute
-from ..tolerances import EQUAL
+from ..tolerances import EQUAL, LOCAL_ITERATIONS
 
 __all__ = ["Predictor", "extrapolated", "map_to_background"]
 
 type Increments = list[NDArray[np.float64]]
-
-#: Most iterations that fit increments of the background to those of the bodies.
-FIT = 30
 
 
 class Predictor:
@@ -173,7 +170,7 @@ def _fit(
     direction.array_w[:] = inverse * rest.array_r
     scaled = direction.copy()
     first = size = rest.dot(scaled)
-    for _ in range(FIT):
+    for _ in range(LOCAL_ITERATIONS):
         if not (np.isfinite(size) and size > EQUAL * first):
             break
         image.set(0.0)

@@ -13,12 +13,9 @@ from petsc4py import PETSc
 import numpy as np
 
 from ..errors import ConvergenceError
-from ..tolerances import EQUAL, LOCAL_ITERATIONS, ROUND_OFF, SOLVED
+from ..tolerances import EQUAL, LAST_PLACES, LOCAL_ITERATIONS, ROUND_OFF, SOLVED
 
 __all__ = ["Projection"]
-
-#: What iterations go on to beyond it, so that momentum does not wander in thousands of steps.
-BEYOND = 0.01
 
 
 class Projection:
@@ -68,7 +65,8 @@ class Projection:
         if guess is not None:
             y.pointwiseDivide(guess, self._unit)
         rest = self._rest(scaled, y)
-        while rest.norm() > 2.0 * BEYOND * ROUND_OFF * size:
+        # (to the last place, so that momentum does not wander in thousands of steps)
+        while rest.norm() > 2.0 * LAST_PLACES * size:
             part = y.duplicate()
             self._solve_scaled(rest, part, size)
             part.axpy(1.0, y)
@@ -98,7 +96,7 @@ class Projection:
             if self._incomplete is None:
                 self._incomplete = _incomplete(self._shifted)
             ksp = self._incomplete
-            ksp.setTolerances(rtol=0.0, atol=BEYOND * ROUND_OFF * size, max_it=LOCAL_ITERATIONS)
+            ksp.setTolerances(rtol=0.0, atol=LAST_PLACES * size, max_it=LOCAL_ITERATIONS)
             ksp.solve(right, y)
             if ksp.getConvergedReason() > 0:
                 return
