@@ -58,7 +58,7 @@ class Meeting:
 
     @cached_property
     def outcome(self) -> Outcome:
-        """What acts on all points that were looked at."""
+        """Tractions on all points that were looked at."""
         x, which, acts = self.approach.x, self.stencil.which, self.acting.acts
         inside = self.within if self.step is None else self.step.inside
         if self.stencil.behind is not None:
