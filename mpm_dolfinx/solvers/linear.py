@@ -135,7 +135,7 @@ class ShiftedFactor:
         self._few = self._strategy.few if suits else 0
 
     def in_words(self) -> str:
-        """Return what solves, and why."""
+        """Return the solver in words, and the reason for it."""
         if self._own_type:
             return f"{self._ksp.getType()} with {self._ksp.getPC().getType()} by PETSc's options"
         if self.iterates:

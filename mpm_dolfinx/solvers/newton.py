@@ -115,7 +115,7 @@ class NewtonSolver:
 
     @property
     def linear_solver(self) -> str:
-        """What solves the linear systems of the last step, and why, in words."""
+        """The solver of the last step's linear systems in words, and the reason for it."""
         return self._factor.in_words()
 
     @property
