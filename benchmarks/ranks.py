@@ -43,6 +43,7 @@ RUNS = (
     "column_free --g0 20e3",
     "column_free --g0 80e3",
     "column_free --domain quad --g0 20e3",
+    "column_free --domain quad --g0 20e3 --on-distortion split",
     "column_free --domain quad --g0 20e3 --f-bar domain",
     "column_free --domain quad --cell 1 --g0 20e3 --f-bar patch",
     "column_free --cell 1 --g0 20e3 --f-bar patch",

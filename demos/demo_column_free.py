@@ -58,8 +58,10 @@
 # large. Both cures are on by default (`shift=1e-13`, `line_search=True`).
 #
 # What is left is hourglass: quadrilaterals with one point have motions without strain, which are
-# mild with two of them each way in a cell, and stop the run with one. Triangles have no such
-# motions. The cure is `quadrature_degree=2` with `f_bar="domain"`.
+# mild with two of them each way in a cell, and stop the run with one.
+# With `on_distortion="split"` those that become concave, or keep a step from converging, are cut
+# into triangles, which have no such motions. The cure is `quadrature_degree=2` with
+# `f_bar="domain"`.
 #
 # ## Implementation
 
@@ -133,6 +135,6 @@ assert yield_violation < 1e-8
 # ## Exercises
 #
 # 1. Use quadrilaterals as large as cells. Where does the run stop? Then give the particles
-#    `quadrature_degree=2` and the body `f_bar="domain"`.
+#    `on_distortion="split"`, or `quadrature_degree=2` and the body `f_bar="domain"`.
 # 2. Four times the weight needs a background four times as wide. How far does the toe get?
 # 3. There turn the cures off, by `solver=mpm.Solver(shift=0.0)`, `line_search=False`, and both.

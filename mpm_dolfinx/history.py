@@ -44,6 +44,7 @@ COUNTERS = (
     "ghost_facets",
     "joint_nodes",
     "folded_domains",
+    "split_domains",
     "lost_particles",
     "lost_volume",
     "lost_mass",
@@ -77,9 +78,9 @@ class Statistics(dict[str, float]):
     that move next to nothing),
     ``ghost_facets`` (with a ghost penalty, in the last step), ``joint_nodes`` (nodes of bodies
     that bear on another one and follow the cell beside theirs, in the last step),
-    ``folded_domains`` (the most after any step; curved ones only), and ``lost_particles``,
-    ``lost_volume`` (undeformed) and ``lost_mass`` (0 where no density is known), the sums over
-    ``history.losses``.
+    ``folded_domains`` (the most after any step; curved ones only), ``split_domains``
+    (quadrilaterals cut in two) and ``lost_particles``, ``lost_volume`` (undeformed) and
+    ``lost_mass`` (0 where no density is known), the sums over ``history.losses``.
     """
 
     def __init__(self) -> None:

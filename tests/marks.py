@@ -16,7 +16,7 @@ SOME = 3
 #: What ranks do together in them: tests that say so stay.
 TOGETHER = re.compile(
     "checkpoint|combination|ends_on|fail|feature|interrupt|mesh|no_sense|refuse|repartition|"
-    "restart|restore|signal"
+    "restart|restore|signal|split"
 )
 #: Physics, texts that are read, arrays that each rank has for itself.
 ALONE = re.compile(

@@ -150,7 +150,7 @@ def dragged(
     V = scenes.vectors(scenes.box([-0.3, -0.2], [2.3, 1.2], [13, 7], QUADRILATERAL, comm), degree)
     base = fem.locate_dofs_geometrical(V, lambda x: x[1] < 0.01)
     body = scenes.box([0.0, 0.0], [2.0, 1.0], [2 * n, n], cell, comm)
-    names = ("outside", "quadrature_degree")
+    names = ("on_distortion", "outside", "quadrature_degree")
     own = {key: options.pop(key) for key in names if key in options}
     particles = mpm.Particles(body, V, method=method, degree=degree, **own)
     die = contact.Rigid(particles, contact.disc((0.7, 1.6), 0.6), friction, law=law)

@@ -49,7 +49,7 @@ class ReferenceForms(BodyForms):
     def __init__(self, R, J, particles, internal=None, low_rank=None, others=(), **options):
         self._stress = internal
         if internal is not None:
-            strain = strain_of(particles, internal.hoop is not None)
+            strain = self._strain = strain_of(particles, internal.hoop is not None)
             dim = strain.dim
             P = particles.quadrature_function("first_piola", (dim, dim))
             A = particles.quadrature_function("tangent", (dim,) * 4)
@@ -74,10 +74,19 @@ class ReferenceForms(BodyForms):
         return False
 
     def _inject(self):
-        """Take stress and tangent to the data of the forms."""
+        """Take stress and tangent to the body mesh as it is: ``P G^T / det G``, G behind it."""
         if self._stress is None:
             return
         stress, tangent = self._stress.first_piola, self._stress.tangent
+        before = self._strain.before_mesh()
+        if before is not None:
+            gdim = before.shape[-1]
+            G = np.tile(np.eye(stress.shape[-1]), (len(stress), 1, 1))
+            G[:, :gdim, :gdim] = before.reshape(-1, gdim, gdim)
+            volume = np.linalg.det(G)[:, None, None]
+            stress = np.einsum("niJ,nMJ->niM", stress, G) / volume
+            tangent = np.einsum("niJkL,nMJ,nNL->niMkN", tangent, G, G, optimize=True)
+            tangent = tangent / volume[:, :, :, None, None]
         for function, values in zip(self._data, (stress, tangent), strict=True):
             function.x.array[: values.size] = values.ravel()
 

@@ -41,6 +41,7 @@ import locking
 import methods
 import soils
 import solver
+import splitting
 import step_size
 import supports
 import validation
@@ -53,6 +54,7 @@ SCRIPTS = (
     step_size,
     load_steps,
     locking,
+    splitting,
     soils,
     methods,
     high_order,

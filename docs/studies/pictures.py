@@ -18,6 +18,10 @@ PICTURES = {
     "snap_through": ("snap_through",),
     "nails": ("structures", "--case", "cut"),
     "column_whole": ("column_free", "--domain", "quad", "--g0", 80e3),
+    "column_split": (
+        *("column_free", "--domain", "quad", "--particles-per-cell", 1),
+        *("--on-distortion", "split"),
+    ),
 }
 
 

@@ -60,7 +60,7 @@ class VirtualWork:
                     "pore_pressure acts by its gradient, which a Function that jumps between cells "
                     "does not have; give one of a continuous space, such as ('Lagrange', 1)."
                 )
-        force = -ufl.grad(p)
+        force = -ufl.grad(p) * self._body.undeformed.mass_ratio
         work: ufl.Form = self._strain.turn * ufl.inner(force, self._v) * self._body.dx_exact
         return self._at_load([work])
 
@@ -69,6 +69,7 @@ class VirtualWork:
         ds = facet_measure(self._body, tags, loads, "tractions")
         terms = [
             self._strain.turn
+            * self._body.undeformed.area_ratio
             * ufl.inner(as_expression(t, self._body, "a traction", (self._dim,)), self._v)
             * ds(tag)
             for t, tag in loads

@@ -27,7 +27,6 @@ from ufl.algorithms.analysis import extract_coefficients, extract_constants
 
 from ..assembly.inputs import as_expression, is_tag, known_tags
 from ..errors import MPMError, agree, warn
-from ..meshes.cells import boundary
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.given import as_positive
@@ -104,7 +103,7 @@ class Support:
     def facets(self) -> NDArray[np.int32]:
         """Return this rank's facets of the body that are on the support (collective)."""
         if self._tagged is None:
-            return boundary(self.particles.mesh)
+            return self.particles.boundary()
         tags, tag = self._tagged
         return np.asarray(tags.find(tag))
 

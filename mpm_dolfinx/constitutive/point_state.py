@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError, as_ours
 from ..materials.base import State
+from ..meshes.remesh import Column
 from .assignment import Assignment
 from .governed import Governed
 from .softening_average import softened
@@ -211,7 +212,7 @@ class Converged(PointState):
         turned = R @ self.laws.by_domain(self.begun) @ R.swapaxes(-1, -2)
         return np.asarray(stress - turned / np.linalg.det(deformation)[..., None, None])
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, Column]:
         """Return all there is, as a checkpoint keeps it.
 
         Returns:
@@ -238,10 +239,12 @@ class Converged(PointState):
             whole["resisted"] = self.resisted
         if self.begun is not None:
             whole["begun"] = self.begun
-        columns = {name: self.laws.by_domain(values) for name, values in whole.items()}
+        columns = {
+            name: Column(self.laws.by_domain(values), "points") for name, values in whole.items()
+        }
         if self.resisted is not None:
             n = self.laws.particles.num_local
-            columns["recovery"] = np.broadcast_to(self.recovery, (n, 3, 3))
+            columns["recovery"] = Column(np.broadcast_to(self.recovery, (n, 3, 3)), "cells")
         return columns
 
     def with_columns(self, arrays: dict[str, NDArray[Any]]) -> Converged:

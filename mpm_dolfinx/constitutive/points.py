@@ -16,6 +16,7 @@ from dolfinx import mesh
 
 from ..errors import agree
 from ..materials.base import State, Update
+from ..meshes.remesh import Column
 from ..particles.field import ParticleField
 from .asked import Asked
 from .assignment import Assignment, Materials
@@ -326,11 +327,11 @@ class MaterialPoints:
             assert last.volume is not None and last.compliance is not None
             self.mean_stress.return_to(last.volume, last.compliance, last.gradient)
 
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, Column]:
         """Return the history of the last converged step; see :meth:`Converged.columns`."""
         columns = self.last.columns()
         if self.averaging is not None:
-            columns["uneven"] = self.averaging.uneven
+            columns["uneven"] = Column(self.averaging.uneven, "points")
         return columns
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:

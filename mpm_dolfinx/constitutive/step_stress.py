@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from .._core import loops
 from ..meshes.quadrature import volume_ratio
+from ..particles.reference import Reference
 from .averaging import Linearised, LowRankTerm, VolumeAveraging
 from .discrete_gradient import Ends, Gradients, abandon, by_end, mean, mean_of_groups
 from .energies import elastic_energy, has_potential, potential_energy
@@ -57,6 +58,7 @@ class _Beginning(NamedTuple):
     """The points at a step's beginning.
 
     Attributes:
+        reference: What the body's mesh is strained by, the same object while it is the same.
         gradient: F - I.
         stress: First Piola stress, without that of a pressure of its own.
         potential: Energy of which the stress is the derivative, where stress is of the whole step.
@@ -64,6 +66,7 @@ class _Beginning(NamedTuple):
         undeformed: Tangent of the undeformed body, if there is damping in proportion to it.
     """
 
+    reference: Reference | None
     gradient: Array
     stress: Array
     potential: Array | None
@@ -311,6 +314,8 @@ class StepStress:
         """See :meth:`system.term.Term.pace`."""
         self._dt, self._share = dt, share
         self._points.laws.pace(dt)
+        if _reference(self._points) is not self._begin.reference:
+            self.settle()
 
     def mute(self, muted: bool) -> None:
         """Leave out, or take in again, what belongs to the whole step."""
@@ -346,8 +351,10 @@ class StepStress:
             stress -= p[:, None, None] * volume.slope
             slope = volume.slope / self._share
             found = replace(found, own=stress, slope=slope, by_pressure=slope)
+        reference = _reference(points)
+        # (a body that was rebased or split learns what its mesh is strained by after that)
         undeformed = undeformed_tangent(points.laws) if self._viscosity > 0.0 else None
-        return _Beginning(H, stress, potential, volume, undeformed), found
+        return _Beginning(reference, H, stress, potential, volume, undeformed), found
 
     def update(self) -> None:
         """Update stress and tangent for the present displacement (collective with F-bar).
@@ -489,3 +496,9 @@ def _may_part(points: MaterialPoints) -> NDArray[np.bool_]:
 def _gradient(points: MaterialPoints) -> Array:
     """Return F - I at the points at the present displacement."""
     return points.strain.gradient().reshape(-1, points.dim, points.dim)
+
+
+def _reference(points: MaterialPoints) -> Reference | None:
+    """Return the present reference of a body's mesh, the same object while it is the same."""
+    undeformed = points.strain.particles.undeformed
+    return undeformed.reference if undeformed.differs else None

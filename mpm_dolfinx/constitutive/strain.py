@@ -84,6 +84,18 @@ class Strain:
 
     # -- In UFL ---------------------------------------------------------------------------
 
+    def before_mesh(self) -> Array | None:
+        """Return the deformation gradient of the mesh that :meth:`ufl_gradient` does not see.
+
+        Returns:
+            Shape ``(n, nq, gdim, gdim)``, or ``None`` where it sees all.
+        """
+        undeformed = self.particles.undeformed
+        if not undeformed.differs:
+            return None
+        gradient = undeformed.reference.gradient
+        return np.asarray(np.eye(gradient.shape[-1]) + gradient)
+
     def integral(self, work: Any) -> ufl.Form:
         """Return the integral of a stress times a gradient of :meth:`ufl_gradient`."""
         form: ufl.Form = self.turn * work * self.particles.dx
@@ -127,7 +139,8 @@ class Revolution(Strain):
             )
         undeformed.revolve(True)
         self.dim = 3
-        self._radius = ufl.SpatialCoordinate(particles.mesh)[0]
+        self._mesh_radius = ufl.SpatialCoordinate(particles.mesh)[0]
+        self._radius = self._mesh_radius if undeformed.origin is None else undeformed.origin[0]
 
     @property
     @override
@@ -148,6 +161,10 @@ class Revolution(Strain):
         """Displacements beyond the mesh; the axis stays where it is."""
         words = "reach across the axis x[0] = 0 (nodes on it must be held against the radius)"
         return words, behind_axis(self.particles)
+
+    @override
+    def before_mesh(self) -> Array | None:
+        return super().before_mesh() if self.particles.undeformed.means is None else None
 
     @override
     def integral(self, work: Any) -> ufl.Form:
@@ -172,7 +189,7 @@ class Revolution(Strain):
     @property
     @override
     def present_turn(self) -> Any:
-        return 2.0 * np.pi * (self._radius + self.particles.displacement[0])
+        return 2.0 * np.pi * (self._mesh_radius + self.particles.displacement[0])
 
     @override
     def with_turn(self, gradient: Any, w: Any) -> Any:

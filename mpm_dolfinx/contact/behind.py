@@ -89,7 +89,7 @@ class Behind:
     def __init__(self, surface: Surface) -> None:
         particles = surface.particles
         body = particles.mesh
-        cell = body.basix_cell()
+        cell, gdim = body.basix_cell(), surface.gdim
         self.surface = surface
         self._cells = surface.layout.cells
         self.nodes: NDArray[np.int64] = particles.domain_nodes[surface.layout.cells].astype(
@@ -101,7 +101,16 @@ class Behind:
         for side, places in enumerate(surface.reference_points):
             here = surface.layout.facets == side
             taken[here] = extrapolation(cell, rule, places, degree)
-        self._weights = taken[:, :, :, None] * surface.mesh_normals()[:, :, None, :]
+        self._weights = taken[:, :, :, None] * surface.undeformed_normals()[:, :, None, :]
+        # What was cut has a gradient of its own, not that of its corners; it is the same everywhere
+        # in the cell, so that the traction may be taken from the mesh.
+        cut = np.flatnonzero(particles.geometry.triangular[self._cells])
+        if len(cut) and particles.undeformed.differs:
+            G = np.eye(gdim) + particles.undeformed.reference.gradient[self._cells[cut]]
+            normals = surface.mesh_normals()[cut]
+            turned = np.einsum("mpJK,mqK->mqpJ", G.swapaxes(2, 3), normals)
+            turned *= (taken[cut] / np.linalg.det(G)[:, None])[:, :, :, None]
+            self._weights[cut] = turned * surface.mesh_area_ratio[cut, :, None, None]
 
     def tractions(self, stress: PointMaterial, which: NDArray[Any] | None = None) -> Array:
         """Return the tractions, shape ``(m, nq, gdim)``.

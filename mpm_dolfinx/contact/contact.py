@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..errors import ConvergenceError, MPMError
 from ..io.identity import same
 from ..io.snapshot import Kept, Taken
+from ..meshes.remesh import Column
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from ..system.term import Motion, PointMaterial, Term, Transfer
@@ -46,7 +47,7 @@ class Contact(Results):
         MPMError: There is no such law.
     """
 
-    movable = True  # it goes with the facets of its bodies
+    movable = remeshable = True  # it goes with the facets of its bodies
 
     def __init__(
         self,
@@ -253,7 +254,7 @@ class Contact(Results):
         """Return the numbers kept besides columns; see :class:`Kept`."""
         return {}
 
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         """Return the columns kept on a body, by its number in the problem."""
         if body is None or body not in self._places:
             return {}
@@ -290,7 +291,7 @@ class KeptContact(Kept):
         super().require(source, taken)
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         return self._contact.columns(body)
 
     @override

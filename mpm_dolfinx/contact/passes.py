@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..assembly.petsc import MatrixSum
 from ..errors import MPMError, agree, agreed
+from ..meshes.remesh import Column
 from ..system.term import PointMaterial
 from .nitsche import Nitsche
 from .one_pass import Pass
@@ -244,11 +245,11 @@ class Passes:
 
     # -- What is kept ---------------------------------------------------------------------------
 
-    def columns(self, number: int) -> dict[str, NDArray[Any]]:
+    def columns(self, number: int) -> dict[str, Column]:
         """Return the columns kept on a body, the first or the second."""
         surface = self.surfaces[number]
         kept = self.every[number].columns() if number < len(self.every) else {}
-        return {name: surface.column(v) for name, v in kept.items()}
+        return surface.columns() | {name: surface.column(v) for name, v in kept.items()}
 
     def restore(self, kept: Sequence[Kept], materials: Sequence[PointMaterial | None]) -> None:
         """Begin anew with what was kept.
@@ -259,6 +260,8 @@ class Passes:
         """
         for surface in self.surfaces:
             surface.settle()
+        for surface, columns in zip(self.surfaces, kept, strict=True):
+            surface.restore(columns)
         self.settle(materials, anew=True)
         for each, columns in zip(self.every, kept, strict=False):
             known = [name for name in TOUCHING if name in columns]
@@ -269,14 +272,13 @@ class Passes:
         """Return the kept columns of each body; ``None``: the contact belongs to no problem."""
         if not self.every:
             return None
-        return [self.columns(number) for number in range(len(self.surfaces))]
+        every = [self.columns(number) for number in range(len(self.surfaces))]
+        return [{name: column.values for name, column in one.items()} for one in every]
 
     def fits(self, kept: Sequence[Kept]) -> bool:
         """Return whether what is kept of other passes is of points in the same places."""
-        return all(
-            "anchor" in one and one["anchor"].shape[2] == each.source.nq
-            for one, each in zip(kept, self.every, strict=False)
-        )
+        sizes = [one["area"].shape[2] for one in kept] == [s.nq for s in self.surfaces]
+        return sizes and all("anchor" in one for one in kept[: len(self.every)])
 
     def require_apart(self) -> None:
         """Raise an error where points are deep in what they do not touch yet."""
@@ -285,12 +287,14 @@ class Passes:
 
 
 def both(one: Kept, other: Kept) -> Kept:
-    """Return the values of two contacts as one: the second's where it alone touches."""
+    """Return the values of two contacts as one: the second's where it alone has any or touches."""
     found: Kept = {}
     for name, values in one.items():
+        new = one["area"] == 0.0
+        if name in TOUCHING:
+            new = other["touches"] & ~one["touches"]
         found[name] = values
         if name in other and other[name].shape == values.shape:
-            new = other["touches"] & ~one["touches"]
             more = (1,) * (values.ndim - new.ndim)
             found[name] = np.where(new.reshape(*new.shape, *more), other[name], values)
     return found

@@ -198,11 +198,13 @@ class Rigid(Contact):
         gap, normal = (surface.of_column(held[name]) for name in ("gap", "normal"))
         there = np.abs(gap - mine.gap) <= NEGLIGIBLE * surface.layout.extent
         alike = there & (np.abs(normal - mine.normals).max(axis=2) <= NEGLIGIBLE)
-        same = surface.column(alike)
+        whole = surface.column(there & there.all(axis=1)[:, None]).values
+        same = surface.column(alike).values
         for name, values in held.items():
-            more = (1,) * (values.ndim - same.ndim)
+            here = whole if name in ("area", "thickness") else same
+            more = (1,) * (values.ndim - here.ndim)
             none = np.zeros_like(values)
-            held[name] = np.where(same.reshape(*same.shape, *more), values, none)
+            held[name] = np.where(here.reshape(*here.shape, *more), values, none)
         return kept
 
     @override
@@ -210,8 +212,8 @@ class Rigid(Contact):
         """Return the columns of its body, with gaps and normals; ``None``: it has no problem."""
         kept, surface = super().held(), self._passes.surfaces[0]
         if kept is not None:
-            kept[0]["gap"] = surface.column(self._pass.gap)
-            kept[0]["normal"] = surface.column(self._pass.normals)
+            kept[0]["gap"] = surface.column(self._pass.gap).values
+            kept[0]["normal"] = surface.column(self._pass.normals).values
         return kept
 
     # -- What is kept ---------------------------------------------------------------------------

@@ -87,7 +87,7 @@ class RigidBody(Driven):
         MPMError: What makes no sense.
     """
 
-    movable = True  # its contacts go with the facets of its bodies
+    movable = remeshable = True  # its contacts go with the facets of its bodies
 
     @collective()
     def __init__(

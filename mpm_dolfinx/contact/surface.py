@@ -21,7 +21,7 @@ from .. import _compat
 from ..assembly.inputs import is_tag, known_tags
 from ..assembly.petsc import create_vector
 from ..errors import MPMError
-from ..meshes.cells import boundary
+from ..meshes.remesh import Column
 from ..parallel.given import require_truth
 from ..particles.particles import Particles
 from ..tolerances import ROUND_OFF
@@ -60,7 +60,7 @@ class Facets:
     def __init__(self, particles: Particles, facets: Any, what: str) -> None:
         body = particles.mesh
         dim = body.topology.dim - 1
-        outer = _marked(body, boundary(body))
+        outer = _marked(body, particles.boundary())
         if facets is not None:
             if not isinstance(facets, list | tuple) or len(facets) != 2:
                 raise MPMError(
@@ -74,7 +74,7 @@ class Facets:
             known_tags(particles, facet_tags, what, [tag])
             # (on any rank that knows the facet)
             outer = np.intersect1d(outer, _marked(body, facet_tags.find(tag)))
-        # Tags are carried along where particles move.
+        # Tags are carried along where particles move; what a cut lays bare is none of them.
         self.tags = mesh.meshtags(body, dim, outer, np.ones(len(outer), dtype=np.int32))
         self._particles = particles
 
@@ -122,12 +122,13 @@ class Layout:
         own: Their places among :meth:`Surface.own_nodes`.
         outward: Whether the normal that the facet's order of nodes gives points outwards, as
             1 or -1, shape ``(m,)``.
-        narrowing: The dimension where the domains behind narrow to a point, as triangles and
-            tetrahedra do, otherwise 1.
+        narrowing: The dimension where the domain behind narrows to a point, as triangles, halves of
+            quadrilaterals and tetrahedra do, elsewhere 1, shape ``(m,)``.
         extent: Largest coordinate of the undeformed body.
         distinct: The nodes of all facets, each once, shape ``(n,)``.
         positions: Where they are in the mesh, shape ``(n, gdim)``.
         edges: Derivatives of positions at the points, shape ``(m, nq, gdim, gdim - 1)``.
+        in_mesh: Area of each point in the mesh, shape ``(m, nq)``.
         around: Length of the way around the axis of a body of revolution, elsewhere 1.
     """
 
@@ -136,11 +137,12 @@ class Layout:
     nodes: NDArray[np.int64]
     own: NDArray[np.int64]
     outward: NDArray[np.float64]
-    narrowing: int
+    narrowing: NDArray[np.int64]
     extent: float
     distinct: NDArray[np.int64]
     positions: NDArray[np.float64]
     edges: NDArray[np.float64]
+    in_mesh: NDArray[np.float64]
     around: NDArray[np.float64]
 
 
@@ -236,26 +238,34 @@ class Surface:
             here = facets == side
             nodes[here] = W.dofmap.list[cells[here]][:, own]
         distinct, places = np.unique(nodes, return_inverse=True)
-        edges = np.einsum("jqk,mki->mqij", self.slopes, x[nodes])
-        self._areas = np.linalg.norm(normals(edges), axis=2) * self._rule
+        origin = self.particles.undeformed.origin
+        X = x if origin is None else origin.x.array.reshape(-1, self.gdim)
+        edges, undeformed = (np.einsum("jqk,mki->mqij", self.slopes, y[nodes]) for y in (x, X))
+        in_mesh, self._areas = (
+            np.linalg.norm(normals(part), axis=2) * self._rule for part in (edges, undeformed)
+        )
         middle = x[W.dofmap.list[cells]].mean(axis=1)
         centre = (self.shapes @ x[nodes]).mean(axis=1)
         n = normals(edges).mean(axis=1)
+        own = self.particles
+        halves = own.trail.halves(own.global_index, own.num_global)
+        narrows = (body.basix_cell() in SIMPLICES) | halves[cells]
         extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
         around = np.ones_like(self._areas)
         if self.axisymmetric:
-            around = 2.0 * np.pi * (self.shapes @ x[nodes])[:, :, 0]
+            around = 2.0 * np.pi * (self.shapes @ X[nodes])[:, :, 0]
         layout = self._layout = Layout(
             cells,
             facets,
             nodes,
             places.reshape(nodes.shape),
             np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0),
-            self.gdim if body.basix_cell() in SIMPLICES else 1,
+            np.where(narrows, self.gdim, 1),
             float(body.comm.allreduce(extent, MPI.MAX)),
             distinct,
             x[distinct],
             edges,
+            in_mesh,
             around,
         )
         volume = self.particles.initial_volume[cells]
@@ -284,6 +294,11 @@ class Surface:
     def reference_points(self) -> list[NDArray[np.float64]]:
         """The points on each facet of the reference cell, each of shape ``(nq, tdim)``."""
         return self._places
+
+    @property
+    def mesh_area_ratio(self) -> NDArray[np.float64]:
+        """Area in the present mesh over that of the undeformed body, shape ``(m, nq)``."""
+        return np.asarray(self.layout.in_mesh / self._areas)
 
     # -- How wide facets have become ------------------------------------------------------------
 
@@ -318,6 +333,14 @@ class Surface:
     def mesh_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals in the present mesh, shape ``(m, nq, gdim)``."""
         return self._outward(self.layout.edges)
+
+    def undeformed_normals(self) -> NDArray[np.float64]:
+        """Return outward unit normals of the undeformed body, as those in the present mesh."""
+        origin = self.particles.undeformed.origin
+        if origin is None:
+            return self.mesh_normals()
+        x = origin.x.array.reshape(-1, self.gdim)[self.layout.nodes]
+        return self._outward(np.einsum("jqk,mki->mqij", self.slopes, x))
 
     def _outward(self, edges: NDArray[np.float64], which: Any = slice(None)) -> NDArray[np.float64]:
         """Return outward unit normals of facets by the derivatives of their positions."""
@@ -375,18 +398,32 @@ class Surface:
 
     # -- What is kept ---------------------------------------------------------------------------
 
-    def column(self, values: NDArray[Any]) -> NDArray[Any]:
+    def column(self, values: NDArray[Any]) -> Column:
         """Return values at points ``(m, nq, ...)`` as a column on the facets of owned cells."""
         body = self.particles.mesh
         count = len(basix.topology(body.basix_cell())[body.topology.dim - 1])
         shape = (self.particles.num_local, count, *values.shape[1:])
         whole = np.zeros(shape, dtype=values.dtype)
         whole[self.layout.cells, self.layout.facets] = values
-        return whole
+        return Column(whole, "facets")
 
     def of_column(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return the values at points that :meth:`column` was given."""
         return np.asarray(values[self.layout.cells, self.layout.facets])
+
+    def columns(self) -> dict[str, Column]:
+        """Return undeformed areas and thicknesses, which another mesh does not show."""
+        thickness = np.repeat(self.thickness[:, None], self.nq, axis=1)
+        return {"area": self.column(self._areas), "thickness": self.column(thickness)}
+
+    def restore(self, columns: dict[str, NDArray[Any]]) -> None:
+        """Take the undeformed areas and thicknesses of before, where there are any."""
+        area = self.of_column(columns["area"])
+        known = area > 0.0
+        self._areas = np.where(known, area, self._areas)
+        thickness = self.of_column(columns["thickness"])[:, 0]
+        self.thickness = np.where(known.all(axis=1), thickness, self.thickness)
+        self.look_at_deleted()
 
 
 def normals(edges: NDArray[Any]) -> NDArray[Any]:

@@ -336,6 +336,8 @@ def _not_in(problem: Problem) -> list[str]:
         "bodies with a length=": any(points.softening is not None for points in problem.points),
         "fields that are solved in turn with the displacements": problem.reduced.terms.alternates,
         "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),
+        "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),
+        "rebased bodies": any(b.undeformed.differs for b in bodies),
         "hooks of a subclass (evaluate, commit, roll_back)": any(
             getattr(kind, name) is not getattr(Problem, name) for name in hooks
         ),

@@ -9,6 +9,7 @@ are written by :mod:`~mpm_dolfinx.io.series`. Whoever keeps an array of his own 
 :class:`Kept`, which says where its values live.
 """
 
+from ..meshes.remesh import Column
 from .snapshot import Kept, fill, of_cells
 
-__all__ = ["Kept", "fill", "of_cells"]
+__all__ = ["Column", "Kept", "fill", "of_cells"]

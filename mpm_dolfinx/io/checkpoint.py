@@ -14,8 +14,9 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from mpi4py import MPI
@@ -24,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError, agree
+from ..meshes.remesh import Place
 from ..tolerances import BLOCK
 from .files import kind_of, replace
 
@@ -40,10 +42,12 @@ class Table(NamedTuple):
     Attributes:
         rows: Global index of each of this rank's rows, shape ``(n,)``.
         columns: Arrays ``(n, ...)`` by name; names, shapes and types are the same on all ranks.
+        places: Where the values of each live, which a file does not say.
     """
 
     rows: NDArray[np.int64]
     columns: dict[str, NDArray[Any]]
+    places: Mapping[str, Place] = MappingProxyType({})
 
 
 class Snapshot(NamedTuple):

@@ -16,6 +16,7 @@ from dolfinx import fem
 
 from ..errors import MPMError, agree
 from ..meshes.cells import input_cell_index
+from ..meshes.remesh import PLACES, Column
 from ..parallel.boundary import Hooked, collective
 from ..parallel.exchange import RowExchange
 from ..parallel.given import require_same
@@ -37,9 +38,9 @@ __all__ = [
 
 
 class Kept(Hooked):
-    """Something that goes with a problem: moved to other ranks, saved and restored.
+    """Something that goes with a problem: split, moved to other ranks, saved and restored.
 
-    A subclass says what it is, and takes it again; give it to
+    A heir says what it is and where it lives, and takes it again; give it to
     :meth:`Problem.keep`. All calls are collective.
 
     Attributes:
@@ -52,17 +53,15 @@ class Kept(Hooked):
         """Return values that are the same on all ranks, in types that JSON has, by name."""
         return {}
 
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         """Return arrays that are spread over the ranks, at the last converged step, by name.
-
-        Each has one row for each cell that this rank owns.
 
         Args:
             body: Number of the body, or ``None``: on the cells of the background.
         """
         return {}
 
-    def on_background(self, number: int) -> dict[str, NDArray[Any]]:
+    def on_background(self, number: int) -> dict[str, Column]:
         """Return arrays over the cells of one of several backgrounds, by name.
 
         Args:
@@ -83,7 +82,7 @@ class Kept(Hooked):
         """
         for number, columns in enumerate(taken.columns):
             body = number if number < len(taken.columns) - 1 else None
-            present = {name: values.shape[1:] for name, values in self.columns(body).items()}
+            present = {name: c.values.shape[1:] for name, c in self.columns(body).items()}
             if {name: values.shape[1:] for name, values in columns.items()} != present:
                 raise MPMError(
                     f"{source} holds {sorted(columns)} under the key {self.key!r}, where this "
@@ -151,20 +150,21 @@ def capture(
         spaces: All background spaces; ``None``: those of the bodies.
 
     Raises:
-        MPMError: Something has not one row for each cell.
+        MPMError: Something does not say where it lives, or has not one row for each cell.
     """
     comm = bodies[0].V.mesh.comm
     tables = []
     for number, body in enumerate(bodies):
         columns = _columns(things, (number, None), body.num_local, comm)
-        tables.append(Table(body.global_index, columns))
+        values = {name: column.values for name, column in columns.items()}
+        tables.append(Table(body.global_index, values, {name: c.at for name, c in columns.items()}))
     for number, V in enumerate(spaces_of(bodies) if spaces is None else spaces):
         index = _cells_of(V, bodies)
         columns = _columns(things, (None, number), len(index), comm)
         some = np.zeros(len(index), dtype=bool)
         for column in columns.values():
-            some |= (column != 0).reshape(len(index), -1).any(axis=1)
-        tables.append(Table(index[some], {name: values[some] for name, values in columns.items()}))
+            some |= (column.values != 0).reshape(len(index), -1).any(axis=1)
+        tables.append(Table(index[some], {name: c.values[some] for name, c in columns.items()}))
     numbers: dict[str, Any] = {}
     for thing in things:
         its = {_name(thing.key, name): value for name, value in thing.numbers().items()}
@@ -320,10 +320,10 @@ def _of_key[Value](key: str, keys: Sequence[str], state: Mapping[str, Value]) ->
 
 def _columns(
     things: Sequence[Kept], place: tuple[int | None, int | None], rows: int, comm: MPI.Comm
-) -> dict[str, NDArray[Any]]:
+) -> dict[str, Column]:
     """Return all that is kept on the cells of a mesh, of a body or a background (collective)."""
     body, background = place
-    columns: dict[str, NDArray[Any]] = {}
+    columns: dict[str, Column] = {}
     keys = [thing.key for thing in things]
     for thing in things:
         mine = thing.columns(body) if background is None else thing.on_background(background)
@@ -334,9 +334,14 @@ def _columns(
                         f"{name!r} belongs to the body, so {name.split(' ')[0]!r} cannot be the "
                         "key of something that is kept."
                     )
-                if not isinstance(column, np.ndarray) or column.shape[:1] != (rows,):
+                if not isinstance(column, Column) or column.at not in PLACES:
                     raise MPMError(
-                        f"{_name(thing.key, name)!r} has the shape {np.shape(column)}, but "
+                        f"{_name(thing.key, name)!r} is kept but does not say where it lives; "
+                        f"return a Column(values, at) with at among {', '.join(PLACES)}."
+                    )
+                if column.values.shape[:1] != (rows,):
+                    raise MPMError(
+                        f"{_name(thing.key, name)!r} has the shape {column.values.shape}, but "
                         f"needs one row for each of the {rows} cells that the rank owns."
                     )
         columns |= {_name(thing.key, name): column for name, column in mine.items()}

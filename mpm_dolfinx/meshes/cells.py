@@ -19,7 +19,6 @@ from dolfinx import graph, io, mesh
 from .. import _compat
 
 __all__ = [
-    "boundary",
     "cell_vertices",
     "coordinate_element",
     "disconnected_mesh",
@@ -43,13 +42,6 @@ def input_cell_index(domain: mesh.Mesh) -> NDArray[np.int64]:
     except RuntimeError:
         index = np.arange(*cells.local_range)
     return np.asarray(index, dtype=np.int64)
-
-
-def boundary(domain: mesh.Mesh) -> NDArray[np.int32]:
-    """Return this rank's own facets on the boundary of a mesh (collective)."""
-    dim = domain.topology.dim
-    domain.topology.create_connectivity(dim - 1, dim)
-    return np.asarray(mesh.exterior_facet_indices(domain.topology))
 
 
 def cell_vertices(domain: mesh.Mesh, count: int) -> NDArray[np.int64]:

@@ -16,7 +16,14 @@ from ..errors import MPMError
 from ..parallel.exchange import RowExchange
 from .cells import coordinate_element, disconnected_mesh, input_cell_index, tags_from_nodes
 
-__all__ = ["Carrier", "Redistribution"]
+__all__ = ["Carrier", "Redistribution", "cell_centres", "neighbour_ranks"]
+
+
+def cell_centres(body: mesh.Mesh) -> NDArray[np.float64]:
+    """Return the mean of the corners of each owned cell, shape ``(n, gdim)``."""
+    count = body.topology.index_map(body.topology.dim).size_local
+    corners = body.geometry.x[_compat.geometry_dofmap(body)[:count]]
+    return np.asarray(corners[:, :, : body.geometry.dim].mean(axis=1))
 
 
 class Carrier:
@@ -24,7 +31,7 @@ class Carrier:
 
     Args:
         source: The mesh before.
-        mesh: The mesh after, of which each cell is one of those before.
+        mesh: The mesh after, of which each cell is one of those before, or a part of one.
         origin: Input index of the one before, for each owned cell after, shape ``(n,)``.
         numbers: Input number after, for each local node before, shape ``(m,)``.
 
@@ -170,7 +177,7 @@ def _moved(source: mesh.Mesh, ranks: NDArray[np.int64]) -> tuple[mesh.Mesh, NDAr
     local = np.arange(len(source.geometry.x), dtype=np.int32)
     numbers = numbering.local_to_global(local)
     corners = exchange(numbers[nodes])
-    where = exchange(np.column_stack([ranks, _neighbour_ranks(source, ranks)]))
+    where = exchange(np.column_stack([ranks, neighbour_ranks(source, ranks)]))
     targets = [[row[0], *sorted({*row[1:]} - {row[0], -1})] for row in where.tolist()]
     x = source.geometry.x[: numbering.size_local, :gdim].copy()
     element = coordinate_element(source)
@@ -200,7 +207,7 @@ def _with_ghosts(cells: Any, values: NDArray[Any]) -> NDArray[Any]:
     return result.astype(values.dtype)
 
 
-def _neighbour_ranks(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.int64]:
+def neighbour_ranks(source: mesh.Mesh, ranks: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the new rank behind each facet of each owned cell; none in a mesh without ghosts."""
     topology, dim = source.topology, source.topology.dim
     cells = topology.index_map(dim)

@@ -131,7 +131,10 @@ class Domains:
             gradient = self.undeformed.gradient_of(self.of_domains())
         if not axisymmetric:
             return gradient
-        return with_hoop(gradient, self.undeformed.hoop, self.of_domains())
+        moved = self.of_domains()
+        if self.undeformed.differs:
+            moved = self.corners() - self.undeformed.domains
+        return with_hoop(gradient, self.undeformed.hoop, moved)
 
     @property
     def deleted(self) -> NDArray[np.bool_]:
@@ -143,12 +146,12 @@ class Domains:
     @property
     def initial_domains(self) -> NDArray[np.float64]:
         """Corners of the undeformed domains, shape ``(n, k, gdim)``."""
-        return self.geometry.corners
+        return self.undeformed.domains.copy()
 
     @property
     def initial_volume(self) -> NDArray[np.float64]:
         """Volume of the undeformed domains, shape ``(n,)``; an area in the plane."""
-        return self.geometry.volumes.copy()
+        return self.undeformed.volume.copy()
 
     @property
     def volume(self) -> NDArray[np.float64]:
@@ -191,20 +194,22 @@ class Domains:
         present displacement. Such a domain covers a part of itself twice; it goes on as long as
         ``det F > 0`` at its quadrature points.
         """
-        geometry = self.geometry
-        folded = geometry.jacobian_bound.vanishes(self.corners(), geometry.orientation)
+        now = self.corners()
+        sign = self.geometry.orientation
+        folded = self.geometry.jacobian_bound.vanishes(now, sign) & ~self.geometry.triangular
         return np.asarray(self.global_index[folded])
 
     def domain_distortion(self) -> NDArray[np.float64]:
         """Return the smallest det J of each domain over its mean, shape ``(n,)``.
 
-        One for an undistorted domain and for a triangle; zero or less where a quadrilateral is
-        concave. For curved domains and hexahedra it is a bound from below.
+        One for an undistorted domain and for a triangle, also one that is half a quadrilateral;
+        zero or less where a quadrilateral is concave. For curved domains and hexahedra it is a
+        bound from below.
         """
         mean = self.volume / quadrature_rule(self.mesh.basix_cell(), 0)[1].sum()
         now = self.corners()
         least = self.geometry.jacobian_bound.lower_bound(now, self.geometry.orientation)
-        return np.asarray(least / np.abs(mean))
+        return np.where(self.geometry.triangular, 1.0, least / np.abs(mean))
 
 
 def behind_axis(domains: Domains) -> NDArray[np.int64]:
@@ -230,4 +235,4 @@ def crossed(domains: Domains) -> NDArray[np.int64]:
     if not quadrilateral or shapes.discontinuous or shapes.degree > 1:
         return domains.global_index[:0]
     inwards = (geometry.corner_jacobians(domains.corners()) <= 0.0).sum(axis=1)
-    return np.asarray(domains.global_index[inwards >= 2])
+    return np.asarray(domains.global_index[(inwards >= 2) & ~geometry.triangular])

@@ -25,7 +25,10 @@ from ..meshes.quadrature import (
 )
 from .options import Coordinates
 
-__all__ = ["Geometry"]
+__all__ = ["RING", "Geometry"]
+
+#: Corners of a quadrilateral one after the other.
+RING = (0, 1, 3, 2)
 
 
 class Geometry:
@@ -159,6 +162,15 @@ class Geometry:
         return np.asarray(np.einsum("qk,nki->nqi", table, domains))
 
     # -- How cells can fold -----------------------------------------------------------------
+
+    @cached_property
+    def triangular(self) -> NDArray[np.bool_]:
+        """Whether each domain is a quadrilateral with two corners in one place, shape ``(n,)``."""
+        if self.mesh.basix_cell() != basix.CellType.quadrilateral:
+            return np.zeros(self.num_local, dtype=bool)
+        ring = self.corners[:, list(RING)]
+        edges = np.linalg.norm(ring - np.roll(ring, 1, axis=1), axis=2)
+        return np.asarray(edges.min(axis=1) <= 1e-12 * edges.max(axis=1))
 
     @cached_property
     def orientation(self) -> NDArray[np.float64]:

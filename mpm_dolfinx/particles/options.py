@@ -32,6 +32,7 @@ from ..transfer.methods import METHODS
 __all__ = [
     "Coordinates",
     "validate_cells",
+    "validate_distortion",
     "validate_options",
     "validate_spaces",
 ]
@@ -201,12 +202,29 @@ def validate_options(
         raise MPMError(f"Finite elements have no background to leave; omit outside={outside!r}.")
 
 
-def validate_free(V: fem.FunctionSpace | None, method: str) -> None:
+def validate_free(V: fem.FunctionSpace | None, method: str, on_distortion: str) -> None:
     """Raise an error unless some nodes may be free and the others carried."""
     if V is None:
         raise MPMError("Without V all nodes are free; omit free=.")
     if method != "cpdi2":
         raise MPMError(f"Free nodes are shared by neighbours; use method='cpdi2', not {method!r}.")
+    if on_distortion != "error":
+        raise MPMError("Domains with free nodes cannot be split; omit on_distortion=.")
+
+
+def validate_distortion(
+    body: mesh.Mesh, method: str, degree: int, quadrature_degree: int | None, policy: str
+) -> None:
+    """Raise an error unless the policy for distorted domains is one for these domains."""
+    if not is_one_of(policy, ("error", "split")):
+        raise MPMError(f"Unknown policy on_distortion={policy!r}; choose 'error' or 'split'.")
+    plain = (body.basix_cell(), _compat.geometry_degree(body)) == (BOX_CELLS[0], 1)
+    one_point = plain and (method, degree) == ("cpdi2", 1) and quadrature_degree in (None, 0, 1)
+    if policy == "split" and not one_point:
+        raise MPMError(
+            "Only quadrilaterals with one quadrature point and method 'cpdi2' can be split "
+            "(on_distortion='split'); others fold less with quadrature_degree=2 and f_bar='domain'."
+        )
 
 
 def validate_cells(domain: mesh.Mesh, what: str) -> None:

@@ -20,6 +20,7 @@ from ..errors import MPMError, agree
 from ..meshes.boxes import mesh_of_boxes
 from ..meshes.quadrature import default_degree
 from ..meshes.redistribution import Carrier, Redistribution
+from ..meshes.remesh import Cuts
 from ..meshes.trail import Trail
 from ..parallel.boundary import collective
 from ..parallel.given import require_same
@@ -33,11 +34,13 @@ from .free import FreeNodes, chosen_nodes
 from .geometry import Geometry
 from .options import (
     validate_cells,
+    validate_distortion,
     validate_free,
     validate_options,
     validate_spaces,
 )
 from .placement import Mover, Placement
+from .reference import Reference
 from .response import MaterialDomains
 from .undeformed import Undeformed
 
@@ -86,6 +89,9 @@ class Particles(MaterialDomains):
             ``"error"`` ends the run with an error, ``"stop"`` without one (both before that
             step), ``"delete"`` goes on without the domain and adds up what is lost. What has passed
             a boundary whose nodes are held, by less than a cell, stays there and has not left.
+        on_distortion: What a problem with a material does about quadrilaterals that a step has
+            made concave: ``"error"`` nothing, until one crosses itself; ``"split"`` cuts them into
+            two triangles each.
         free: Which nodes are free at the beginning: a function of undeformed coordinates, shape
             ``(3, n)``, such as ``mpm.region(...)``; ``(cell_tags, tag)``, or with a list of tags:
             all nodes of these cells; or local nodes of W, ``[]`` for none yet. ``"auto"``: all are,
@@ -110,7 +116,8 @@ class Particles(MaterialDomains):
         domain_nodes: Local nodes of W of each owned domain, shape ``(n, k)``.
         outside: The policy for domains that leave the background.
         deletion: Which domains are deleted, with ``outside="delete"``, otherwise ``None``.
-        undeformed: The undeformed body, and the rule that carries the history in it.
+        on_distortion: As given.
+        undeformed: The undeformed body, where its mesh does not show it too.
         shares_nodes: Whether neighbours share their nodes, as with ``"cpdi2"``.
         trail: The way from ``body`` to the present mesh.
         mover: What moves the nodes.
@@ -131,6 +138,7 @@ class Particles(MaterialDomains):
         degree: int = 1,
         quadrature_degree: int | None = None,
         outside: str = "error",
+        on_distortion: str = "error",
         free: Any = None,
     ) -> None:
         validate_spaces(body, V)
@@ -139,13 +147,14 @@ class Particles(MaterialDomains):
         require_same(body.comm, free=free is not None)
         own = V is None or free is not None
         validate_options(body, V, method, degree, quadrature_degree, outside, own)
+        validate_distortion(body, method, degree, quadrature_degree, on_distortion)
         if free is not None:
-            validate_free(V, method)
+            validate_free(V, method, on_distortion)
         validate_cells(body, "body")
         if own:
             cell = body.basix_cell().name
             quadrature_degree = quadrature_degree or default_degree(cell, degree, free=True)
-        self.method, self.outside = method, outside
+        self.method, self.outside, self.on_distortion = method, outside, on_distortion
         self.trail = Trail()
         self._degrees = degree, quadrature_degree
         self._frees = None if free is None else _is_auto(free)
@@ -232,21 +241,27 @@ class Particles(MaterialDomains):
         family = "Lagrange" if shared else "Discontinuous Lagrange"
         return Geometry(body, family, *self._degrees)
 
-    def _settle(self, geometry: Geometry, deletable: bool) -> None:
+    def _settle(self, geometry: Geometry, deletable: bool, moved: bool = False) -> None:
         """Live on a body mesh, where nothing is displaced: at the start and after each move.
 
         Args:
             geometry: The mesh (collective).
             deletable: Whether domains may be deleted.
+            moved: Whether the mesh's nodes are elsewhere than in the undeformed body.
         """
-        undeformed = Undeformed(geometry)
+        undeformed = Undeformed(geometry, len(self.trail.cuts) > 0, moved)
         self._live_on(undeformed, Deletion(geometry.mesh, geometry.W) if deletable else None)
         self.load = LoadFactor(geometry.mesh, 0.0)
         self.proportional = fem.Constant(geometry.mesh, 1.0)
         free = None if self._frees is None else FreeNodes(self, self.locate, self._frees)
         self.placement = Placement(undeformed, self.mover, self.deletion, free)
 
-    def live_on(self, move: Carrier) -> None:
+    def live_on(
+        self,
+        move: Carrier,
+        cuts: Cuts | None = None,
+        positions: NDArray[np.float64] | None = None,
+    ) -> None:
         """Live on another mesh of the same body, undeformed (collective).
 
         ``mesh``, ``W``, ``displacement`` and ``load`` are new ones then. What else there is to
@@ -254,13 +269,27 @@ class Particles(MaterialDomains):
 
         Args:
             move: Takes what lives on the present mesh to the other one.
+            cuts: Quadrilaterals that it cuts in two, the same on all ranks.
+            positions: Where it moves the domains' nodes to, shape ``(n, k, gdim)``.
         """
-        self.trail.append(move)
+        before: Reference | None = None
+        if positions is not None:
+            before = self.present_reference()
+        elif cuts is None and self.undeformed.differs:
+            before = self.undeformed.reference
+        moved = positions is not None or self.undeformed.origin is not None
+        self.trail.append(move, cuts, positions is not None)
         geometry = self._geometry_on(move.mesh)
         if self.is_free:
             self.mover = Mover(geometry.W, self.method)
             self.V, self.increment = self.mover.V, self.mover.increment
-        self._settle(geometry, self.deletion is not None)
+        self._settle(geometry, self.deletion is not None, moved)
+        if before is not None:  # at once, for what is made of the undeformed body
+            self.undeformed.refer(Reference(*(move.of_cells(values) for values in before)))
+
+    def present_reference(self) -> Reference:
+        """Return the undeformed body as a mesh shows it that has the last converged positions."""
+        return self.undeformed.reference._replace(gradient=self.placement.gradient())
 
     @collective()
     def repartition(self) -> None:
@@ -309,6 +338,19 @@ class Particles(MaterialDomains):
             MPMError: A Function that is not piecewise constant.
         """
         return self.trail.carry(thing)
+
+    def boundary(self) -> NDArray[np.int32]:
+        """Return this rank's own facets of ``mesh`` on the body's boundary (collective).
+
+        Where quadrilaterals were cut in two, halves do not share their diagonal: DOLFINx takes it
+        for a boundary, and this does not.
+        """
+        return self.trail.boundary(self.mesh)
+
+    @property
+    def origin_index(self) -> NDArray[np.int64]:
+        """Input index of the domain that each particle is, or is half of, shape ``(n,)``."""
+        return self.trail.origin_index(self.global_index, self.num_global)
 
     # -- Nodes ----------------------------------------------------------------------------
 

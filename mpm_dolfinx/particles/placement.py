@@ -108,7 +108,7 @@ class Placement:
 
         def centred() -> ParticleState:
             return ParticleState(
-                undeformed.mean(geometry.corners),
+                undeformed.mean(undeformed.domains),
                 undeformed.mean(geometry.corners + self._of_domains(displacement)),
                 # methods that ask for it have one point
                 np.eye(geometry.gdim) + gradient()[:, 0],

@@ -40,7 +40,8 @@ def probe(particles: Particles, points: Any, field: str = "displacement") -> NDA
         Values, shape ``(m, ...)``; of a single point without the first index.
 
     Raises:
-        MPMError: Points outside the body, or a name that there is not.
+        MPMError: Points outside the body, a name that there is not, or a body that was rebased,
+            whose mesh does not show the undeformed body.
     """
     comm, gdim = particles.mesh.comm, particles.mesh.geometry.dim
     with agree(comm):
@@ -50,6 +51,11 @@ def probe(particles: Particles, points: Any, field: str = "displacement") -> NDA
             given = np.zeros(0)
         if given.shape[-1:] != (gdim,) or given.ndim > 2 or not np.isfinite(given).all():
             raise MPMError(f"points must be numbers of shape (m, {gdim}), or one point ({gdim},).")
+        if particles.undeformed.origin is not None:
+            raise MPMError(
+                "The body was rebased, so that its mesh does not show where points were in the "
+                "undeformed body; probe() before that, or look at particles.centroid."
+            )
     at = np.zeros((given.size // gdim, 3))
     at[:, :gdim] = given
     cells = _cells(particles, at)

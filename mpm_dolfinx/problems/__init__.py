@@ -13,7 +13,7 @@ water add their laws.
 A problem holds bodies, a system, a solver and a stepper, and lets them go by when these change. How
 that is done is in one place, :meth:`.ProblemState.renew`: the state is captured, something changes,
 the problem is built again and takes the state back (:mod:`~mpm_dolfinx.problems.state`, with all
-that has a state in :mod:`~mpm_dolfinx.problems.kept`). What changes are the ranks of particles or
-what the problem is made of, by stages (:mod:`~mpm_dolfinx.problems.staging`,
-:mod:`~mpm_dolfinx.problems.stages`).
+that has a state in :mod:`~mpm_dolfinx.problems.kept`). What changes are meshes
+(:mod:`~mpm_dolfinx.problems.remeshing`) or what the problem is made of, by stages
+(:mod:`~mpm_dolfinx.problems.staging`, :mod:`~mpm_dolfinx.problems.stages`).
 """

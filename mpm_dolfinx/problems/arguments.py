@@ -372,19 +372,18 @@ def as_conditions(bcs: Any, spaces: Sequence[fem.FunctionSpace]) -> list[fem.Dir
 
 
 def require_no_conditions_on_bodies(
-    bcs: Sequence[fem.DirichletBC], bodies: Sequence[Particles]
+    bcs: Sequence[fem.DirichletBC], bodies: Sequence[Particles], consequence: str
 ) -> None:
-    """Raise an error where conditions hold free nodes of bodies that are to move to other ranks.
+    """Raise an error where conditions hold free nodes of bodies that are to have other meshes.
 
     Args:
         bcs: Dirichlet conditions.
         bodies: The bodies.
+        consequence: Says what cannot be.
     """
     free = [body.W for body in bodies if body.free_nodes is not None]
     if any(_compat.is_condition_on(bc, W) for bc in bcs for W in free):
-        raise MPMError(
-            "Dirichlet conditions on W lie on the present body mesh, so the particles cannot move."
-        )
+        raise MPMError(f"Dirichlet conditions on W lie on the present body mesh, so {consequence}.")
 
 
 def carried(particles: Particles, assignment: Any) -> Any:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -228,8 +228,11 @@ class Body:
             facet_tags=self.particles.carry(self.facet_tags),
         )
 
-    def require_movable(self) -> None:
-        """Raise an error unless the body can move to other ranks.
+    def require_movable(self, consequence: str = "the particles cannot move") -> None:
+        """Raise an error unless the body can be taken to another mesh.
+
+        Args:
+            consequence: What else cannot be.
 
         Raises:
             MPMError: Something lives on its present mesh.
@@ -237,22 +240,32 @@ class Body:
         for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
             if holds(getattr(self, name), ufl.core.expr.Expr):
                 raise MPMError(
-                    f"{name} is written on the present body mesh, so the particles cannot move; "
-                    "give a function that makes it from a mesh, e.g. "
+                    f"{name} is written on the present body mesh, so {consequence}; give a "
+                    "function that makes it from a mesh, e.g. "
                     "lambda mesh: ufl.SpatialCoordinate(mesh)[1]."
                 )
         for name, value in ({} if self.pore_fluid is None else vars(self.pore_fluid)).items():
             if holds(value, ufl.core.expr.Expr):
                 raise MPMError(
-                    f"{name} is written on the present body mesh, so the particles cannot move; "
-                    "give numbers."
+                    f"{name} is written on the present body mesh, so {consequence}; give numbers."
                 )
         laws = self.material.values() if isinstance(self.material, Mapping) else [self.material]
         for law in laws:
             if any(isinstance(value, np.ndarray) for value in law.parameters.values()):
                 raise MPMError(
                     "A material has arrays of parameters, one value for each particle of a rank, "
-                    "so the particles cannot move; use DG0 Functions."
+                    f"so {consequence}; use DG0 Functions."
+                )
+
+    def require_movable_nodes(self, consequence: str) -> None:
+        """Raise an error unless the nodes of the body's mesh can be moved; see above."""
+        self.require_movable(consequence)
+        if self.length is not None:
+            raise MPMError(f"length= averages over the undeformed body, so {consequence}.")
+        for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
+            if holds(getattr(self, name), Callable):
+                raise MPMError(
+                    f"{name} is a function of the mesh, whose nodes move, so {consequence}."
                 )
 
 

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, override
+from typing import Any, Literal, override
 
 from mpi4py import MPI
 
@@ -18,9 +18,11 @@ from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, ParticleOutsideError
 from ..history import Attempt, History, Loss, Stage, Statistics, Step
 from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..meshes.remesh import Column
 from ..particles.field import CarriedField
 from ..particles.free import chosen_nodes
 from ..particles.particles import Particles
+from ..particles.reference import Reference
 from ..stepping.automatic import control_of
 from ..stepping.control import Converged, Progress, Run
 from ..system.reduced import ReducedSystem
@@ -35,7 +37,11 @@ class Bodies(Kept):
         self._bodies = bodies
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def numbers(self) -> dict[str, Any]:
+        return {"cuts": [body.trail.cuts.tolist() for body in self._bodies]}
+
+    @override
+    def columns(self, body: int | None) -> dict[str, Column]:
         return {} if body is None else _columns_of(self._bodies[body])
 
     def require(self, source: str, taken: Taken) -> None:
@@ -53,22 +59,28 @@ class Bodies(Kept):
             _restore_body(body, columns)
 
 
-def _columns_of(body: Particles) -> dict[str, NDArray[Any]]:
+def _columns_of(body: Particles) -> dict[str, Column]:
     """Return the last converged step of a body, cell by cell."""
     nodal = body.placement.displacement[body.domain_nodes]
-    columns = {"displacement": nodal}
+    columns = {"displacement": Column(nodal, "nodes")}
     if body.free_nodes is not None:
         state = body.free_nodes.chosen.astype(np.float64) - body.free_nodes.spent
-        columns["free"] = state[body.domain_nodes]
+        columns["free"] = Column(state[body.domain_nodes], "nodes")
     if body.deletion is not None:
-        columns["deleted"] = body.deletion.mask
-        columns["kept"] = body.deletion.kept(nodal)
+        columns["deleted"] = Column(body.deletion.mask, "cells")
+        columns["kept"] = Column(body.deletion.kept(nodal), "nodes")
+    undeformed = body.undeformed
+    if undeformed.mass_share is not None:
+        columns |= undeformed.reference.columns()
+        columns["mass share"] = Column(undeformed.mass_shares(), "nodes")
+    if undeformed.origin is not None:
+        columns["mesh nodes"] = Column(body.geometry.corners, "nodes")
     return columns
 
 
 def _restore_body(body: Particles, columns: dict[str, NDArray[Any]]) -> None:
     """Make what :func:`_columns_of` once returned the last converged step (collective)."""
-    d, placement = body.displacement.x, body.placement
+    d, placement, undeformed = body.displacement.x, body.placement, body.undeformed
     d.array.reshape(-1, body.geometry.gdim)[body.domain_nodes] = columns["displacement"]
     d.scatter_forward()
     if body.free_nodes is not None:
@@ -77,6 +89,10 @@ def _restore_body(body: Particles, columns: dict[str, NDArray[Any]]) -> None:
         placement.choose_free(*(chosen_nodes(body.W, some) for some in nodes))
     if body.deletion is not None:
         placement.restore_deleted(columns["deleted"], columns["kept"])
+    if undeformed.mass_share is not None:
+        reference = (columns[f"reference {name}"] for name in Reference._fields)
+        undeformed.refer(Reference(*reference))
+        undeformed.set_mass_shares(columns["mass share"])
     body.commit()
 
 
@@ -86,6 +102,7 @@ class Material(Kept):
     Args:
         get: Returns it at the last converged step.
         put: Takes it again.
+        at: Where arrays live that do not say it; ``None``: they must.
         points: The materials at the points of each body, which may be weakened.
     """
 
@@ -95,9 +112,10 @@ class Material(Kept):
         self,
         get: Callable[[], list[dict[str, Any]]],
         put: Callable[[list[dict[str, NDArray[Any]]]], None],
+        at: Any,
         points: Sequence[MaterialPoints] = (),
     ) -> None:
-        self._get, self._put, self._points = get, put, points
+        self._get, self._put, self._at, self._points = get, put, at, points
 
     @override
     def numbers(self) -> dict[str, Any]:
@@ -105,18 +123,23 @@ class Material(Kept):
         return {"weakening": factors} if factors else {}
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         if body is None:
             return {}
-        return {name: np.asarray(value) for name, value in self._get()[body].items()}
+        return {
+            name: value
+            if isinstance(value, Column) or self._at is None
+            else Column(np.asarray(value), self._at)
+            for name, value in self._get()[body].items()
+        }
 
     @override
     def require(self, source: str, taken: Taken) -> None:
         for number, history in enumerate(taken.columns[:-1]):
             present = self.columns(number)
-            for name, values in present.items():
+            for name, column in present.items():
                 shape = None if name not in history else history[name].shape[1:]
-                if shape != values.shape[1:]:
+                if shape != column.values.shape[1:]:
                     raise MPMError(
                         f"{source} has no history {name!r} of the kind that this problem has."
                     )
@@ -191,9 +214,9 @@ class Functions(Kept):
         self._of = shares
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         own = [] if body is None else self._of[body]
-        return {f.name: of_cells(f) for f in own}
+        return {f.name: Column(of_cells(f), "nodes") for f in own}
 
     @override
     def require(self, source: str, taken: Taken) -> None:
@@ -235,9 +258,9 @@ class Values(Kept):
         return {"units": [field.unit for field in self._reduced.unknowns.values]}
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         own = [] if body is None else self._carried[body]
-        return {one.field.name: of_cells(one.field.previous) for one in own}
+        return {one.field.name: Column(of_cells(one.field.previous), one.place) for one in own}
 
     @override
     def restore(self, taken: Taken) -> None:
@@ -283,7 +306,7 @@ class Increments(Kept):
         return {"": sizes, "measures": moved is not None, "moved": bool(moved)}
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         if body is None:
             return {}
         past = self._predictor.past
@@ -291,7 +314,9 @@ class Increments(Kept):
         if self._predictor.moved:
             every["moved"] = self._predictor.moved
         return {
-            f"{key}{name}": of_cells(_function(one.W, increments[self._number(one)]))
+            f"{key}{name}": Column(
+                of_cells(_function(one.W, increments[self._number(one)])), _place(one)
+            )
             for key, increments in every.items()
             for name, one in self._of[body].items()
         }
@@ -315,6 +340,11 @@ class Increments(Kept):
         self._predictor.past = [(size, increments(str(i))) for i, size in enumerate(numbers[""])]
         if numbers["moved"]:
             self._predictor.moved = increments("moved")
+
+
+def _place(one: Particles | CarriedField) -> Literal["points", "nodes"]:
+    """Return where values live: at the points or the nodes of domains."""
+    return one.place if isinstance(one, CarriedField) else "nodes"
 
 
 class Past(Kept):
@@ -394,7 +424,7 @@ class Standing(Kept):
         }
 
     @override
-    def on_background(self, number: int) -> dict[str, NDArray[Any]]:
+    def on_background(self, number: int) -> dict[str, Column]:
         converged, run = self.progress.converged, self.progress.run
         totals = {
             "prescribed": converged.prescribed[number],
@@ -404,7 +434,7 @@ class Standing(Kept):
         if converged.followed and converged.followed[number] is not None:
             totals["followed"] = converged.followed[number]
         return {
-            name: of_cells(_function(self._spaces[number], values))
+            name: Column(of_cells(_function(self._spaces[number], values)), "nodes")
             for name, values in totals.items()
         }
 

@@ -140,7 +140,7 @@ class MovingProblem(TimeProblem):
     def velocity(self) -> fem.Function | list[fem.Function]:
         """Velocity on W at the last converged step; a list where particles are one.
 
-        As ``particles.displacement`` it is a new Function after a repartition.
+        As ``particles.displacement`` it is a new Function after a split, rebase or repartition.
         """
         several = isinstance(self.particles, list | tuple)
         return list(self.inertia.velocities) if several else self.inertia.velocities[0]

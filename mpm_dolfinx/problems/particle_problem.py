@@ -79,6 +79,11 @@ class ParticleProblem(Problem):
         if fields and J is not None:
             raise MPMError("With fields= the tangent is the derivative of R; omit J.")
         tangents = [None] * len(bodies) if J is None else one_for_each(J, bodies, "J")
+        if any(body.on_distortion == "split" for body in bodies):
+            raise MPMError(
+                "The residual is written on the present body mesh, so domains cannot be split; "
+                "on_distortion='split' is for mpm.QuasiStaticProblem."
+            )
         self._given = [
             Contribution(r, j, symmetric) for r, j in zip(residuals, tangents, strict=True)
         ]

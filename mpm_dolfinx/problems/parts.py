@@ -24,6 +24,7 @@ from ..errors import MPMError
 from ..parallel.compilation import compiled_form
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
+from ..particles.undeformed import separate_nodes
 from ..stabilisation.choice import joints_of, stabilisation_of
 from ..system.body import ActingStress, BodyTerm, StepForce
 from ..system.field import Field
@@ -114,18 +115,19 @@ class Built:
         """A description of each body: its material and its loads."""
         return [given.words() for given in self.contributions]
 
-    def mass_matrices(self, number: int) -> NDArray[np.float64]:
-        """Return ``int density Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective).
+    def mass_matrices(self, number: int, ratio: Any = None) -> NDArray[np.float64]:
+        """Return ``int density ratio Q_c Q_d dX`` of each owned domain, ``(n, k, k)`` (collective).
 
         Args:
             number: Number of the body.
+            ratio: UFL; ``None``: that of the mass per volume of its mesh to the density.
         """
         body, mass = self.bodies[number], self.contributions[number].mass
         assert mass is not None
-        apart = ("Discontinuous Lagrange", body.W.ufl_element().degree)
-        space = fem.functionspace(body.mesh, apart)  # each domain's nodes by themselves
+        space = separate_nodes(body.W)
         product = ufl.TrialFunction(space) * ufl.TestFunction(space)
-        matrix = fem.assemble_matrix(compiled_form(mass(product), **self.form_options))
+        ratio = body.undeformed.mass_ratio if ratio is None else ratio
+        matrix = fem.assemble_matrix(compiled_form(mass(ratio * product), **self.form_options))
         n, k = body.num_local, space.dofmap.list.shape[1]
         return np.array(matrix.data[: n * k * k].reshape(n, k, k))
 

@@ -119,6 +119,7 @@ def damages(setup: Setup, physics: Physics) -> list[Damage]:
             "initial_stress=": body.initial_stress is not None,
             f"method={body.particles.method!r}": not body.particles.shares_nodes,
             "outside='delete'": body.particles.deletion is not None,
+            "on_distortion='split'": body.particles.on_distortion == "split",
             **physics.not_for_cracks(),
         }
         for what, given in refused.items():
@@ -222,7 +223,8 @@ def _loads(given: Body, work: VirtualWork, density: Density) -> list[ufl.Form]:
     """Return the dead loads of a body, tractions last (collective)."""
     found: list[ufl.Form] = []
     if given.body_force is not None:
-        found.append(-work.body_force(density.value, given.body_force))
+        mass = density.value * given.particles.undeformed.mass_ratio
+        found.append(-work.body_force(mass, given.body_force))
     if given.pore_pressure is not None:
         found.append(-work.seepage(given.pore_pressure))
     if given.tractions:

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem, mesh
+from dolfinx import fem
 from ufl.algorithms import extract_coefficients
 from ufl.core.expr import Expr
 
@@ -167,23 +167,25 @@ class _Water(Physics):
             weight = body.load * pores.density * b
         stored = q * (flow.J - flow.J_n) + q * storage * (p - flow.p_n)
         flux = flow.flux(k, p, weight)
-        turn, slope = flow.strain.turn, ufl.grad(q)
-        R: ufl.Form = turn * (-stored + dt * ufl.dot(flux, slope)) * body.dx
-        normal = ufl.FacetNormal(body.mesh)
+        turn = flow.strain.turn
+        slope = flow.undeformed.grad(q)
+        own = flow.undeformed.volume_ratio * turn
+        R: ufl.Form = own * (-stored + dt * ufl.dot(flux, slope)) * body.dx
+        normal, area = flow.undeformed.normal(), body.undeformed.area_ratio * turn
         if pores.drained:
             ds = facet_measure(body, given.facet_tags, pores.drained, "drained")
             inside = flow.conductivity(k) * normal
             degree = flow.p.W.ufl_element().degree
-            penalty = PENALTY * degree * _inverse_size(body.mesh, normal)
+            penalty = PENALTY * degree * flow.undeformed.inverse_size(normal)
             for value, tag in pores.drained:
                 gap = p - as_expression(value, body, "a drained pressure", ())
                 out = -q * ufl.dot(flux, normal) + gap * ufl.dot(slope, inside)
                 out -= penalty * ufl.dot(normal, inside) * gap * q
-                R += turn * dt * out * ds(tag)
+                R += area * dt * out * ds(tag)
         if pores.inflow:
             ds = facet_measure(body, given.facet_tags, pores.inflow, "inflow")
             for value, tag in pores.inflow:
-                R += turn * dt * as_expression(value, body, "an inflow", ()) * q * ds(tag)
+                R += area * dt * as_expression(value, body, "an inflow", ()) * q * ds(tag)
         return R
 
 
@@ -333,6 +335,59 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
             raise
 
 
+class _Undeformed:
+    """The undeformed body in UFL on its mesh, which is another shape of it after a rebase.
+
+    Args:
+        strain: What the body is strained in.
+
+    Attributes:
+        volume_ratio: Volume in the undeformed body over that in the mesh.
+    """
+
+    def __init__(self, strain: Strain) -> None:
+        self._strain, self._body = strain, strain.particles
+        origin = self._origin = self._body.undeformed.origin
+        self._to_mesh = None if origin is None else ufl.inv(ufl.grad(origin))
+        self.volume_ratio = self._body.undeformed.volume_ratio
+
+    def grad(self, w: Any) -> Any:
+        """Return the gradient of a field on the mesh."""
+        return ufl.grad(w) if self._to_mesh is None else ufl.dot(ufl.grad(w), self._to_mesh)
+
+    def strained(self, w: Any) -> Any:
+        """Return the gradient of :meth:`Strain.ufl_gradient`."""
+        return self._strain.with_turn(self.grad(w), w)
+
+    def displacement_gradient(self, d: Any) -> Any:
+        """Return ``F - I`` for a displacement of the mesh, shape ``(dim, dim)``."""
+        if self._origin is None:
+            return self.strained(d)
+        return self.strained(d + ufl.SpatialCoordinate(self._body.mesh) - self._origin)
+
+    def normal(self) -> Any:
+        """Return the outward unit normal of the undeformed body."""
+        normal = ufl.FacetNormal(self._body.mesh)
+        if self._to_mesh is None:
+            return normal
+        turned = ufl.dot(normal, self._to_mesh)
+        return turned / ufl.sqrt(ufl.dot(turned, turned))
+
+    def inverse_size(self, normal: Any) -> Any:
+        """Return one over the size of domains across their facets.
+
+        It is that across, whatever the length along: what Nitsche's penalty must outweigh is the
+        derivative across the facet, which is large in flat domains. It is one over the height in a
+        parallelogram whose sides are normal to each other, and at least that elsewhere.
+
+        Args:
+            normal: That of :meth:`normal`.
+        """
+        across = ufl.JacobianInverse(self._body.mesh)
+        across *= normal if self._to_mesh is None else ufl.dot(self._to_mesh, normal)
+        return ufl.sqrt(ufl.dot(across, across))
+
+
 class _Flow:
     """Quantities of the balance of a body's water.
 
@@ -349,8 +404,9 @@ class _Flow:
         self.q = ufl.TestFunction(filled.field.W)
         self._v = ufl.TestFunction(body.W)
         d, unit = body.displacement, ufl.Identity(strain.dim)
-        self._gradient = strain.with_turn(ufl.grad(d), d)
-        before = strain.with_turn(ufl.grad(filled.before), filled.before)
+        self.undeformed = _Undeformed(strain)
+        self._gradient = self.undeformed.displacement_gradient(d)
+        before = self.undeformed.displacement_gradient(filled.before)
         self.J, self.J_n = (
             1.0 + ufl.tr(g) if small else ufl.det(unit + g) for g in (self._gradient, before)
         )
@@ -363,12 +419,13 @@ class _Flow:
 
     def work_of_pressure(self) -> ufl.Form:
         """Return the virtual work of the pore pressure."""
-        test = self.strain.with_turn(ufl.grad(self._v), self._v)
+        test = self.undeformed.strained(self._v)
         if self._small:
             change = ufl.tr(test)
         else:
             change = ufl.inner(_cofactors(ufl.Identity(self.strain.dim) + self._gradient), test)
-        work: ufl.Form = -self.strain.turn * self.p * change * self.strain.particles.dx
+        own = self.undeformed.volume_ratio * self.strain.turn
+        work: ufl.Form = -own * self.p * change * self.strain.particles.dx
         return work
 
     def conductivity(self, k: Any) -> Any:
@@ -386,25 +443,10 @@ class _Flow:
             p: Pore pressure.
             weight: Weight of water per volume, or ``None``.
         """
-        drive = ufl.grad(p)
+        drive = self.undeformed.grad(p)
         if weight is not None:
             drive = drive - (weight if self._small else self._F.T * weight)
         return -self.conductivity(k) * drive
-
-
-def _inverse_size(domain: mesh.Mesh, normal: Any) -> Any:
-    """Return one over the size of cells across their facets.
-
-    It is that across, whatever the length along: what Nitsche's penalty must outweigh is the
-    derivative across the facet, which is large in flat domains. It is one over the height in a
-    parallelogram whose sides are normal to each other, and at least that elsewhere.
-
-    Args:
-        domain: The mesh.
-        normal: Outward unit normal of the facet.
-    """
-    across = ufl.JacobianInverse(domain) * normal
-    return ufl.sqrt(ufl.dot(across, across))
 
 
 def _cofactors(F: Any) -> Any:

@@ -34,7 +34,7 @@ from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
 from ..stepping.automatic import ErrorControl
 from ..stepping.displacement_control import DisplacementControl
-from ..stepping.loading import Stepper
+from ..stepping.loading import Mender, Stepper
 from ..stepping.progress import with_bar
 from ..stepping.solving import System
 from ..stepping.trial import Trial
@@ -87,6 +87,7 @@ class Problem(Hooked):
         solver: How it is solved.
         terms: What else acts on the bodies.
         fields: Unknowns besides displacements, with residuals of their own.
+        mender: What changes meshes between steps, if anything.
         spaces: Background spaces of fields.
 
     Attributes:
@@ -123,6 +124,7 @@ class Problem(Hooked):
         solver: Solver,
         terms: Sequence[Term],
         fields: Sequence[ParticleField] = (),
+        mender: Mender | None = None,
         spaces: Sequence[fem.FunctionSpace] = (),
     ) -> None:
         self.particles, self.fields = particles, fields
@@ -135,8 +137,8 @@ class Problem(Hooked):
         self._output = Output()
         self._held = Release()
         self.trial = Trial(self)
-        self._stepper = Stepper(self.trial, self._held)
-        self.state = ProblemState(self, self._stepper, self._held, self._output)
+        self._stepper = Stepper(self.trial, self._held, mender)
+        self.state = ProblemState(self, self._stepper, self._held, self._output, mender)
         self.staging = Staging(self.state, self._stepper, self._held)
         self.built = NOTHING
         self.build()
@@ -626,7 +628,7 @@ class Problem(Hooked):
     def keep(self, thing: Kept) -> None:
         """Let something of the user's own go with the problem.
 
-        It moves to other ranks with the bodies, and is saved and restored.
+        It is split and rebased with the bodies, moves to other ranks, and is saved and restored.
 
         Args:
             thing: An heir of :class:`mpm_dolfinx.io.Kept` with a key of its own.
@@ -712,6 +714,9 @@ class Problem(Hooked):
         """The materials at the points of each body; none where the residual is all."""
         return self.built.points
 
+    #: Where arrays of :meth:`converged_state` live that do not say it; ``None``: they must.
+    history_at: ClassVar[str | None] = "cells"
+
     #: Whether :meth:`converged_state` has all data at points that forms hold.
     keeps_data: ClassVar[bool] = False
 
@@ -719,7 +724,9 @@ class Problem(Hooked):
         """Return the history at the last converged step, for a checkpoint.
 
         Returns:
-            One dictionary for each body: arrays ``(n, ...)`` of its owned particles by name.
+            One dictionary for each body: arrays ``(n, ...)`` of its owned particles by name, or
+            :class:`mpm_dolfinx.io.Column`, which says where they live. A problem that can be
+            split needs the latter.
         """
         return [{} for _ in self.bodies]
 

@@ -33,6 +33,7 @@ from .initial_stress import initial_stress_at_points
 from .parts import Contribution
 from .physics import MaterialBodies, Physics, damages
 from .problem import Law, Problem
+from .remeshing import Remeshing, as_indices
 from .setup import Setup
 from .solver import Solver, as_solver
 from .stages import Addition, Given, Removal, chosen_cells
@@ -100,6 +101,8 @@ class QuasiStaticProblem(Problem):
         self.damage = damages(setup, self._physics)
         terms = [*terms, *self.damage]
         setup = replace(setup, terms=tuple(terms))
+        if any(body.on_distortion == "split" for body in particles):
+            setup.require_divisible()
         for body in particles:
             moved = particles[0].V.mesh.comm.allreduce(int(np.any(body.converged_displacement)))
             for support in supports:
@@ -108,6 +111,7 @@ class QuasiStaticProblem(Problem):
         self.setup = setup
         self._parameters = _Parameters(setup)
         self._materials = MaterialBodies(self._physics)
+        self._remeshing = Remeshing(self)
         one = particles if isinstance(bodies, list | tuple) else particles[0]
         super().__init__(
             one,
@@ -115,6 +119,7 @@ class QuasiStaticProblem(Problem):
             background,
             as_solver(solver),
             terms,
+            mender=self._remeshing,
             spaces=self._physics.field_spaces,
         )
         self._carry_stress([body.initial_stress for body in given])
@@ -330,6 +335,10 @@ class QuasiStaticProblem(Problem):
         if given.may_crack:
             raise MPMError("A body with a law of fracture cannot be added; begin with it.")
         particles = given.particles
+        if particles.on_distortion == "split":
+            replace(
+                self.setup, given=(*self.setup.given, given), bodies=(*self.setup.bodies, given)
+            ).require_divisible()
         np.copyto(particles.load.value, float(self.bodies[0].load.value))
         np.copyto(particles.proportional.value, float(self.bodies[0].proportional.value))
         self._go_on(name, Addition(self, given), sudden)
@@ -380,7 +389,7 @@ class QuasiStaticProblem(Problem):
         if not is_number(threshold) or not 0.0 <= threshold <= 1.0:
             raise MPMError(f"threshold must be a share from 0 to 1, not {threshold!r}.")
         self.setup.require_movable()
-        require_no_conditions_on_bodies(self.bcs, self.bodies)
+        require_no_conditions_on_bodies(self.bcs, self.bodies, "the particles cannot move")
         ranks = [body.best_ranks() for body in self.bodies]
         leaving = sum(int(np.count_nonzero(r != self._comm.rank)) for r in ranks)
         share = self._comm.allreduce(leaving) / sum(body.num_global for body in self.bodies)
@@ -395,6 +404,49 @@ class QuasiStaticProblem(Problem):
         self.state.renew(move, lambda snapshot: snapshot)
         self.history.statistics.count("repartitions")
         return True
+
+    @collective("particles")
+    def split(self, particles: Sequence[int], body: int = 0) -> None:
+        """Cut quadrilaterals with one point in two, as they are now (collective).
+
+        Each is cut along the diagonal that makes the better triangles; the halves have its
+        deformation gradient, stress and history. Mass at each node, and with it momentum, does
+        not change, nor do the forces: what was in equilibrium still is. The first half keeps the
+        global index, the second ones follow after all others (``particles.origin_index``). As
+        after :meth:`repartition`, ``particles.mesh``, ``W``, ``displacement`` and ``load`` are
+        new ones then; ``particles.carry`` takes tags and DG0 Functions over.
+
+        Args:
+            particles: Global indices; each on one rank or on several.
+            body: Number of the body, where there are several.
+
+        Raises:
+            MPMError: Domains or a problem that cannot be split. Nothing is changed.
+        """
+        self.reign.require()
+        if body not in range(len(self.bodies)):
+            raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
+        chosen = [np.zeros(0, dtype=np.int64) for _ in self.bodies]
+        with agree(self._comm):
+            chosen[body] = as_indices(particles)
+        self._remeshing.split(chosen)
+
+    @collective()
+    def rebase(self) -> None:
+        """Take the body as it is now for the mesh that displacements are counted from (collective).
+
+        ``particles.displacement`` starts from zero. All else goes on: deformation gradient, stress
+        and history, mass at each node, ``initial_volume`` and ``initial_centroid``, dead loads per
+        undeformed area, and the undeformed shape in pictures and series. The objects on the body
+        mesh are new ones as after :meth:`split`.
+
+        Raises:
+            MPMError: Domains or a problem that cannot be rebased. Nothing is changed.
+        """
+        self.reign.require()
+        self._remeshing.rebase()
+
+    history_at = None
 
     @override
     def converged_state(self) -> list[dict[str, Any]]:

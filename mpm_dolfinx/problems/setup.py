@@ -8,6 +8,7 @@ these are other ones.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from ..boundary.supports import Support
@@ -111,16 +112,52 @@ class Setup:
         """Return the same on the present meshes of the particles (collective)."""
         return replace(self, bodies=tuple(body.carried() for body in self.bodies))
 
-    def require_movable(self) -> None:
-        """Raise an error unless all bodies can move to other ranks.
+    def require_movable(self, consequence: str = "the particles cannot move") -> None:
+        """Raise an error unless all bodies can be taken to other meshes.
+
+        Args:
+            consequence: What else cannot be.
 
         Raises:
             MPMError: Something lives on a present mesh.
         """
         for body in self.bodies:
-            body.require_movable()
-        for one in (*self.supports, *(term for term in self.terms if not term.movable)):
+            body.require_movable(consequence)
+        self.require_no(self.supports, consequence)
+        self.require_no((term for term in self.terms if not term.movable), consequence)
+
+    def require_remeshable(self, consequence: str) -> None:
+        """Raise an error unless all terms follow bodies that are split or rebased; see above."""
+        self.require_no((term for term in self.terms if not term.remeshable), consequence)
+
+    def require_no(self, staying: Iterable[Support | Term], consequence: str) -> None:
+        """Raise an error where there is one that does not follow its body."""
+        for one in staying:
             raise MPMError(
-                f"A {type(one).__name__} lives on the present body mesh, so the particles cannot "
-                "move."
+                f"A {type(one).__name__} lives on the present body mesh, so {consequence}."
+            )
+
+    def require_divisible(self) -> None:
+        """Raise an error unless domains may be split.
+
+        Raises:
+            MPMError: They may not.
+        """
+        self.require_movable("domains cannot be split")
+        self.require_remeshable("domains cannot be split")
+        for body in self.bodies:
+            if body.f_bar != "none":
+                raise MPMError(
+                    f"Domains cannot be split with f_bar={body.f_bar!r}, whose averages they would "
+                    "change; it keeps most domains from folding by itself."
+                )
+            if body.length is not None:
+                raise MPMError(
+                    "Domains cannot be split in a body with a length=, which averages over the "
+                    "undeformed body; omit one of them."
+                )
+        if self.axisymmetric:
+            raise MPMError(
+                "Domains of a body of revolution cannot be split, since the halves have other "
+                "radii; use quadrature_degree=2 with f_bar='domain'."
             )

@@ -186,7 +186,7 @@ class Addition(_OfSetup):
 
     @override
     def renews(self, body: int | None, name: str) -> bool:
-        return body is None and name in ("moduli", "fields units")
+        return body is None and name in ("moduli", "cuts", "fields units")
 
 
 def join(terms: Sequence[Term], before: Sequence[Term]) -> None:

@@ -23,7 +23,7 @@ from ..io.snapshot import Kept, adopt, capture, require_key
 from ..parallel.given import require_same
 from ..particles.particles import Particles
 from ..stepping.control import Run
-from ..stepping.loading import Stepper
+from ..stepping.loading import Mender, Stepper
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
 from ..system.term import Term
@@ -66,6 +66,10 @@ class Stateful(Protocol):
         """Return name and parameters of each body's materials."""
 
     @property
+    def history_at(self) -> str | None:
+        """Where arrays of the history live that do not say it; ``None``: they must."""
+
+    @property
     def keeps_data(self) -> bool:
         """Whether the history has all data at points that forms hold."""
 
@@ -80,13 +84,14 @@ class ProblemState:
     """All that goes with a problem: on other meshes, to other ranks, into files and back.
 
     It outlives the meshes of the bodies. What a state is known by is the problem as it was made at
-    first, before the first stage.
+    first, before domains were split and before the first stage.
 
     Args:
         problem: The problem, which is not kept alive.
         stepper: Knows how far it is.
         release: What stages hold back, a term that every problem has.
         output: The time series that it writes.
+        mender: What changes meshes of its bodies, if anything.
 
     Attributes:
         kept: What goes with the problem besides what every problem has, and the term that it
@@ -101,10 +106,11 @@ class ProblemState:
         stepper: Stepper,
         release: Release,
         output: Output,
+        mender: Mender | None,
     ) -> None:
         self._reference = weakref.ref(problem)
         self._stepper, self._release = stepper, release
-        self._output = output
+        self._output, self._mender = output, mender
         self.kept: list[tuple[Term | None, Kept]] = []
         self.numbered: list[Term | None] = []
         self._stages: list[str] = []
@@ -196,6 +202,7 @@ class ProblemState:
             kept.Material(
                 problem.converged_state,
                 problem.set_converged_state,
+                problem.history_at,
                 problem.built.points,
             ),
             kept.Functions(functions, problem.bodies, needed),
@@ -216,6 +223,10 @@ class ProblemState:
     def _present(self) -> dict[str, Any]:
         problem = self.problem
         return identity.identity(problem.bodies, problem.built.carried, problem.laws())
+
+    def before_remeshing(self) -> None:
+        """Note what the problem is known by, before its body meshes change (collective)."""
+        self._identity = self.identity()
 
     def after_stage(self, name: str, first: dict[str, Any]) -> None:
         """Note that the problem is another one now.
@@ -238,6 +249,13 @@ class ProblemState:
         Raises:
             MPMError: Functions that cannot be kept, or that are missing.
         """
+        if functions and any(
+            len(body.trail.cuts) or body.trail.rebases for body in self.problem.bodies
+        ):
+            raise MPMError(
+                "Domains were split or the body rebased, so functions= on its new mesh could not "
+                "be restored; save the state without them."
+            )
         things, _ = self._all(functions)
         snapshot = capture(things, self.problem.bodies, self.spaces)
         snapshot.numbers["identity"] = self.identity() | {"the stages": list(self._stages)}
@@ -319,6 +337,8 @@ class ProblemState:
         identity.require_same(self.identity(), snapshot, source, self._comm)
         written = snapshot.numbers["series"]
         series = read_series(self._comm, written)
+        if self._mender is not None:
+            self._mender.repeat(snapshot, bool(functions), source)
         run = self.adopt(snapshot, functions, source)
         self._stepper.resume(run if resume else None)
         history = problem.history

@@ -137,8 +137,8 @@ def strength_reduction(
 
     Raises:
         MPMError: The problem is not at its whole load, a step there with the strength that it has
-            fails, its steps have a duration (PorousProblem, DynamicProblem), or no material has a
-            strength.
+            fails, its steps have a duration (PorousProblem, DynamicProblem), no material has a
+            strength, or domains may be split.
     """
     _require(problem, step, tolerance, most, displacement)
     start = [body.converged_displacement.copy() for body in problem.bodies]
@@ -270,6 +270,11 @@ def _require(
         raise MPMError(
             "strength_reduction() needs a body whose law has a strength; those of this problem are "
             f"elastic: {', '.join(sorted({type(law).__name__ for law in laws}))}."
+        )
+    if any(body.on_distortion == "split" for body in problem.bodies):
+        raise MPMError(
+            "strength_reduction() follows the nodes of the bodies, which a split of domains "
+            "changes; set on_distortion = 'error' of the bodies before."
         )
 
 

@@ -270,6 +270,10 @@ class ErrorControl:
         self._size = max(self._size, self._least)
         self._now, self._before, self._holds = now, ratio, False
 
+    def begin_anew(self) -> None:
+        """Try a step as at the beginning, after what made smaller ones fail has changed."""
+        self._size, self._before, self._holds = FIRST, None, False
+
     def cut_back(self, gave_up: bool = False) -> bool:
         """Halve the step; return False where it is at its smallest, or a limit is found.
 

@@ -60,6 +60,9 @@ class Control(Protocol):
     def accept(self, iterations: int) -> None:
         """Go to the target, in so many linear solves."""
 
+    def begin_anew(self) -> None:
+        """Begin anew, after what made steps fail has changed."""
+
     def cut_back(self, gave_up: bool = False) -> bool:
         """Make the step smaller; return False where it is at its smallest, or a limit is found."""
 
@@ -135,6 +138,12 @@ class StepControl:
             and (easy or self._taken >= self._patience)
         ):
             self._size, self._taken, self._trying = 2 * self._size, 0, not easy
+
+    def begin_anew(self) -> None:
+        """Try whole steps again, after what made them fail has changed."""
+        self._size, self._failed = self._largest, None
+        self._moved = self._wary = self._trying = False
+        self._taken, self._patience = 0, PATIENCE
 
     def cut_back(self, gave_up: bool = False) -> bool:
         """Halve the step; return False where it is at its smallest, or a limit is found.

@@ -21,10 +21,11 @@ from ..errors import MPMError, agree
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.given import is_number
+from ..particles.geometry import RING
 from ..particles.particles import Particles
 from ..reals import as_finite
 from ..system.reduced import ReducedSystem
-from ..tolerances import EQUAL, NEGLIGIBLE
+from ..tolerances import EQUAL, LAST_PLACES, NEGLIGIBLE
 
 __all__ = ["ControlledSystem", "DisplacementControl"]
 
@@ -86,6 +87,7 @@ class DisplacementControl:
         self.value = float(value)
         self.functional = functional
         self._space: fem.FunctionSpace | None = None
+        self._rebases = particles.trail.rebases
         self.row()
 
     def require_for(self, bodies: Sequence[Particles], path: bool) -> None:
@@ -100,11 +102,20 @@ class DisplacementControl:
         if self.functional is not None:
             raise MPMError(
                 "functional is written on the present body mesh, so the particles cannot "
-                "move; control a point, or omit repartition."
+                "move or be split; control a point, or leave repartition and on_distortion alone."
             )
 
     def row(self) -> PETSc.Vec:
-        """Return the functional's coefficients of this rank's own dofs of W (collective)."""
+        """Return the functional's coefficients of this rank's own dofs of W (collective).
+
+        Raises:
+            MPMError: The body was rebased meanwhile.
+        """
+        if self._rebases != self.particles.trail.rebases:
+            raise MPMError(
+                "The body was rebased since this displacement control was made; make a new one, "
+                "with a point of the rebased body and a displacement that is counted from there."
+            )
         if self._space is not self.particles.W:
             self._space = self.particles.W
             self._row = self.particles.T.createVecLeft()
@@ -121,9 +132,14 @@ class DisplacementControl:
 
     def _of_point(self) -> NDArray[np.float64]:
         W, comm = self.particles.W, self.particles.mesh.comm
-        basis = BackgroundBasis(W).at(self._point[None][: int(comm.rank == 0)])
-        every = comm.bcast((basis.nodes, basis.values, basis.found))
-        nodes, values, found = (array[0] for array in every)
+        found = False
+        if len(self.particles.trail.cuts):
+            nodes, values, found = self._in_triangles()
+        if not found:
+            asked = self._point[None][: int(comm.rank == 0)]
+            basis = BackgroundBasis(W).at(asked)
+            every = comm.bcast((basis.nodes, basis.values, basis.found))
+            nodes, values, found = (array[0] for array in every)
         if not found:
             where = tuple(float(x) for x in self._point)
             raise MPMError(f"The point {where} of the displacement control is not in the body.")
@@ -132,6 +148,28 @@ class DisplacementControl:
         own = (nodes >= first) & (nodes < last)
         row[nodes[own] - first] = values[own, None] * self._direction
         return row.ravel()
+
+    def _in_triangles(self) -> tuple[NDArray[np.int64], NDArray[np.float64], bool]:
+        """Return nodes and weights of the point in half a quadrilateral, and whether it is in one.
+
+        The map of such a half is singular at the corner that is there twice.
+        """
+        particles = self.particles
+        ring = particles.domain_nodes[particles.geometry.triangular][:, RING]
+        x = particles.W.tabulate_dof_coordinates()[:, : len(self._point)]
+        edges = np.linalg.norm(x[ring] - x[np.roll(ring, 1, axis=1)], axis=2)
+        kept = (edges.argmin(axis=1)[:, None] + np.arange(1, 4)) % 4
+        nodes = np.take_along_axis(ring, kept, axis=1)
+        start, sides = x[nodes[:, 0]], x[nodes[:, 1:]] - x[nodes[:, :1]]
+        along = np.linalg.solve(sides.transpose(0, 2, 1), (self._point - start)[:, :, None])
+        weights = np.column_stack([1.0 - along.sum(axis=1), along[:, :, 0]])
+        error = LAST_PLACES * np.abs(self._point).max() * np.abs(np.linalg.inv(sides)).sum((1, 2))
+        inside = weights.min(axis=1) + error
+        best = np.argsort(-inside)[:1]
+        numbers = particles.W.dofmap.index_map.local_to_global(nodes[best].ravel())
+        mine = inside[best].max(initial=-np.inf), numbers, weights[best].ravel()
+        most, numbers, values = max(particles.mesh.comm.allgather(mine), key=lambda one: one[0])
+        return numbers, values, bool(most >= -NEGLIGIBLE)
 
     def _of_form(self, functional: Any) -> NDArray[np.float64]:
         particles = self.particles

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
-from typing import NoReturn
+from typing import NoReturn, Protocol
 
 from mpi4py import MPI
 
@@ -18,6 +18,7 @@ from dolfinx import fem
 
 from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError, warn
 from ..history import Step
+from ..io.checkpoint import Snapshot
 from ..log import STEPS, tell
 from ..parallel.boundary import of_user
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
@@ -32,10 +33,23 @@ from .leaving import left_outside, may_stop
 from .solving import Goal, set_load
 from .trial import Owner, Path, Trial
 
-__all__ = ["Stepper"]
+__all__ = ["Mender", "Stepper"]
 
 #: How often nodes are freed at the end of a step.
 MOST_FREED = 10
+
+
+class Mender(Protocol):
+    """Changes of the bodies' meshes between steps. All calls are collective."""
+
+    def after_step(self) -> None:
+        """Look at what a converged step has made of the domains."""
+
+    def mend(self, error: MPMError) -> bool:
+        """Change what made the smallest step fail; return whether to go on."""
+
+    def repeat(self, snapshot: Snapshot, functions: bool, source: str) -> None:
+        """Make the changes with which a state was made."""
 
 
 class Stepper:
@@ -44,14 +58,15 @@ class Stepper:
     Args:
         trial: Tries the steps of the problem.
         release: Holds back what a stage changes at once.
+        mender: What changes meshes between steps, if anything.
 
     Attributes:
         trial: Tries the steps, and knows the last that has converged.
         interrupted: The run that a checkpoint interrupted, if the next one is to go on with it.
     """
 
-    def __init__(self, trial: Trial, release: Release) -> None:
-        self.trial, self._release = trial, release
+    def __init__(self, trial: Trial, release: Release, mender: Mender | None = None) -> None:
+        self.trial, self._release, self._mender = trial, release, mender
         self.interrupted: Run | None = None
         self._begins_stage = False
 
@@ -112,7 +127,8 @@ class Stepper:
         with held() if comm.size > 1 else nullcontext(Hold()) as hold:
             last = Hold()
             run = self._begin(chosen, update, control, span, adaptivity)
-            if control is not None and repartition is not None:
+            may_split = any(body.on_distortion == "split" for body in owner.bodies)
+            if control is not None and (repartition is not None or may_split):
                 control.require_movable()
             while not run.control.finished:
                 with held() as now:
@@ -219,8 +235,12 @@ class Stepper:
             if self._goes_on_after(error, run, end):
                 return None
             limit = run.limit if trial.newton.gave_up else None
+            told = trial.placed(error, limit)
+            if self._mender is not None and self._mender.mend(told):
+                run.control.begin_anew()
+                return None
             trial.give_up(update)
-            raise trial.placed(error, limit) from error.__cause__
+            raise told from error.__cause__
         except MPMError as error:
             trial.give_up(update)
             raise trial.placed(error) from error.__cause__
@@ -408,6 +428,8 @@ class Stepper:
     def _end_step(self, repartition: float | None) -> None:
         """Do what is to be done between two steps (collective)."""
         self.trial.owner.end_step()
+        if self._mender is not None:
+            self._mender.after_step()
         if repartition is not None:
             self.trial.owner.repartition(repartition)
 

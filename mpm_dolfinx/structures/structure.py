@@ -412,6 +412,8 @@ def _as_bodies(bodies: Any, what: str) -> list[Particles]:
     every: list[Any] = list(bodies) if isinstance(bodies, list | tuple) else [bodies]
     for body in every:
         require_shared_nodes(f"A {what}", body)
+        if body.trail.rebases > 0:
+            raise MPMError(f"A {what} cannot be drawn in a body whose mesh was rebased.")
     if not every or len({id(body) for body in every}) < len(every):
         raise MPMError(f"A {what} needs one body or several that differ.")
     return every

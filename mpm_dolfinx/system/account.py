@@ -45,8 +45,8 @@ class Account:
             self.kinetic, self._strain = kinetic, strain
             self.note(time, strain)
 
-    def lose(self, kinetic: float) -> None:
-        """Book as lost how the kinetic energy changes between steps, as domains are deleted."""
+    def remesh(self, kinetic: float) -> None:
+        """Book as lost how other meshes or domains change the kinetic energy between steps."""
         if self._entries:
             self._totals[TOTALS.index("lost")] += self.kinetic - kinetic
         self.kinetic = kinetic

@@ -19,6 +19,7 @@ from dolfinx import fem
 from ..assembly.field_forms import FieldForms
 from ..errors import ConvergenceError, MPMError, agree
 from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..meshes.remesh import Column
 from ..parallel.boundary import collective
 from ..parallel.conjugate_gradients import conjugate_gradients
 from ..parallel.given import is_number
@@ -254,11 +255,11 @@ class FieldEquation(Term):
     def kept(self) -> Sequence[Kept]:
         return [_Values(self, self.name or f"equation{self._number}")]
 
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         """Return the arrays that are kept on a body, by its number in the problem."""
         if body != self._body_number:
             return {}
-        return {self.field.name: of_cells(self.field.previous)}
+        return {self.field.name: Column(of_cells(self.field.previous), "nodes")}
 
     def take(self, taken: Taken) -> None:
         """Take what was kept (collective)."""
@@ -278,7 +279,7 @@ class _Values(Kept):
         self._equation, self.key = equation, key
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         return self._equation.columns(body)
 
     @override

@@ -172,7 +172,7 @@ class Inertia(Term):
     from_outside = True
     one_sided = False
     symmetric = True
-    movable = True  # velocities go with the nodes
+    movable = remeshable = True  # velocities go with the nodes
 
     def __init__(
         self,
@@ -235,7 +235,7 @@ class Inertia(Term):
             owned = [own.sum(axis=(1, 2)) for own in self._mass.domains]
             for term in self._rest.terms:
                 term.weigh([owned[self.state.number(body)] for body in term.bodies])
-            self._account.lose(self._mass.kinetic(self.velocities))
+            self._account.remesh(self._mass.kinetic(self.velocities))
         return self._mass
 
     # -- A run ------------------------------------------------------------------------------------

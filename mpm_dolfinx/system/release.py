@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..io.snapshot import Kept, Taken, fill, of_cells
+from ..meshes.remesh import Column, Place
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .term import Term
@@ -150,25 +151,29 @@ class Release(Term):
     def kept(self) -> Sequence[Kept]:
         return [_Held(self)]
 
-    def columns(self, body: int) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int) -> dict[str, Column]:
         """Return the forces held back at the nodes of a body, and for its fields."""
         if not self._nodal:
             return {}
-        return {name: of_cells(self._nodal[number]) for number, name in self._of_body(body)}
+        return {
+            name: Column(of_cells(self._nodal[number]), place)
+            for number, name, place in self._of_body(body)
+        }
 
-    def _of_body(self, body: int) -> list[tuple[int, str]]:
-        """Return the numbers of a body and of its fields, and what they are called."""
-        found = [(body, "force")]
+    def _of_body(self, body: int) -> list[tuple[int, str, Place]]:
+        """Return the numbers of a body and of its fields, what they are called, and where."""
+        found: list[tuple[int, str, Place]] = [(body, "force", "forces")]
         for number, one in enumerate(self.bodies):
             if isinstance(one, CarriedField) and one.field.particles is self.bodies[body]:
-                found.append((number, f"force {one.field.name}"))
+                place: Place = "forces" if one.place == "nodes" else one.place
+                found.append((number, f"force {one.field.name}", place))
         return found
 
-    def on_cells(self, number: int) -> dict[str, NDArray[Any]]:
+    def on_cells(self, number: int) -> dict[str, Column]:
         """Return the forces held back on a background."""
         if not self._reactions:
             return {}
-        return {"reaction": of_cells(self._reactions[number])}
+        return {"reaction": Column(of_cells(self._reactions[number]), "nodes")}
 
     def take(self, taken: Taken) -> None:
         """Take over what was once kept (collective)."""
@@ -178,7 +183,7 @@ class Release(Term):
             return
         self._nodal = [fem.Function(one.W) for one in self.bodies]
         for body, columns in enumerate(taken.columns[:-1]):
-            for number, name in self._of_body(body):
+            for number, name, _ in self._of_body(body):
                 fill(self._nodal[number], columns[name])
         for V, columns in zip(self._spaces, taken.backgrounds, strict=True):
             self._reactions.append(fem.Function(V))
@@ -203,11 +208,11 @@ class _Held(Kept):
         return {"remaining": self._release.remaining}
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         return {} if body is None else self._release.columns(body)
 
     @override
-    def on_background(self, number: int) -> dict[str, NDArray[Any]]:
+    def on_background(self, number: int) -> dict[str, Column]:
         return self._release.on_cells(number)
 
     @override

@@ -94,6 +94,7 @@ class Term(Hooked):
         from_outside: Whether its forces come from outside of its bodies: then they count for the
             scale of forces, as loads and reactions do.
         movable: Whether it follows bodies whose particles move to other ranks.
+        remeshable: Whether it follows bodies that are split or rebased.
         takes_stress: Whether it takes the material's stress for all that its bodies bear.
         follows_load: Whether what the load factor does depends on the displacement.
         axisymmetric: Whether its forces are those of a body of revolution, ``None`` where it does
@@ -110,6 +111,7 @@ class Term(Hooked):
     evaluation: ClassVar[str] = "update()"
     from_outside: ClassVar[bool] = True
     movable: bool = False
+    remeshable: bool = False
     takes_stress: bool = False
     follows_load: bool = False
     axisymmetric: bool | None = None

@@ -14,12 +14,15 @@ from dolfinx import fem
 
 from ..errors import MPMError
 from ..io.snapshot import Kept, Taken, fill, of_cells, spaces_of
+from ..meshes.remesh import Column, Place
 from ..particles.particles import Particles
 from .account import Account
 from .schemes import Scheme
 from .term import Term
 
 __all__ = ["Velocities"]
+
+FORCES = ("force", "external")
 
 
 class Velocities(Kept):
@@ -191,13 +194,13 @@ class Velocities(Kept):
         }
 
     @override
-    def columns(self, body: int | None) -> dict[str, NDArray[Any]]:
+    def columns(self, body: int | None) -> dict[str, Column]:
         if body is None:
             return self.on_background(0)
-        return {name: of_cells(its[body]) for name, its in self._fields().items()}
+        return {name: _column(name, its[body]) for name, its in self._fields().items()}
 
     @override
-    def on_background(self, number: int) -> dict[str, NDArray[Any]]:
+    def on_background(self, number: int) -> dict[str, Column]:
         """Return the rates of Dirichlet values in the last step."""
         spaces = spaces_of(self.bodies)
         if number >= len(spaces):  # that of a pressure, which has no rates
@@ -206,7 +209,7 @@ class Velocities(Kept):
         if self.last > 0.0 and number < len(self._rates):
             function.x.array[: len(self._rates[number])] = self._rates[number]
             function.x.scatter_forward()
-        return {"rates": of_cells(function)}
+        return {"rates": Column(of_cells(function), "nodes")}
 
     @override
     def require(self, source: str, taken: Taken) -> None:
@@ -244,3 +247,9 @@ class Velocities(Kept):
             fill(function, columns["rates"])
             owned = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
             self._rates.append(np.array(function.x.array[:owned]))
+
+
+def _column(name: str, function: fem.Function) -> Column:
+    """Return the column of a field in a checkpoint."""
+    place: Place = "forces" if name in FORCES else "nodes"
+    return Column(of_cells(function), place)

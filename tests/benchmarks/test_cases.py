@@ -104,7 +104,7 @@ RUNS = {
     ),
     "free-quad": (
         "column_free",
-        "--domain quad --cell 1 --steps 20 --g0 15e3 --quadrature-degree 2 --f-bar domain",
+        "--domain quad --cell 1 --steps 20 --g0 15e3 --on-distortion split",
         {"yield_violation": 1e-8, "cutbacks": 2},
     ),
     "ufl": ("ufl_material", "--elements 4 --steps 12", {"difference": 1e-2}),
@@ -429,7 +429,7 @@ KEYS = {
     "compaction": {"error", "error_position", "particles"},
     "cantilever": {"shortening", "deflection", "error"},
     "column_roller": {"error_syy", "error_sxx", "top", "particles", "yield_violation"},
-    "column_free": {"top", "toe", "y_mean", "yield_violation", "worst_domain"},
+    "column_free": {"top", "toe", "y_mean", "yield_violation", "worst_domain", "split_domains"},
     "ufl_material": {"difference"},
     "domain_distortion": {
         f"{what}_{method}"
@@ -605,6 +605,7 @@ def test_column_goes_on_from_its_checkpoint(mpi_tmp_path, capfd, monkeypatch):
         close = WORLD.size > 1 and value is not None
         assert resumed[key] == (pytest.approx(value, rel=1e-9) if close else value), key
     assert run("column_free", ["--resume"], capfd)[0] == 2
+    assert run("column_free", ["--on-distortion", "split"], capfd)[0] == 2  # of triangles
 
 
 @pytest.mark.parametrize(

@@ -145,19 +145,25 @@ def test_a_block_falls_on_a_mat_without_inertia(scheme):
 
 
 @pytest.mark.parametrize(
-    ("static", "friction"),
-    thinned(2, [(True, 0.5), (True, 0.0), (False, 0.5)]),
+    ("static", "friction", "split"),
+    thinned(4, [(True, 0.5, True), (True, 0.0, False), (False, 0.5, True), (False, 0.5, False)]),
 )
-def test_corners_are_pressed_into_a_mat(static, friction):
+def test_corners_are_pressed_into_a_mat(static, friction, split):
     # Points come round corners, from one facet to another: the difference of their gaps from both
     # is no motion.
-    problem, _ = on_a_mat(1.0, friction, QUADRILATERAL, static, scheme="conserving")
+    problem, touch = on_a_mat(1.0, friction, QUADRILATERAL, static, scheme="conserving")
     before, pushed = problem.momentum, 0
-    for _ in problem.steps(time=0.5, dt=0.02):
+    for number, _ in enumerate(problem.steps(time=0.5, dt=0.02)):
         force = problem.reaction(problem.bcs[0])
         if static:  # (else the floor's nodes have a mass of their own)
             np.testing.assert_allclose((problem.momentum - before)[1], 0.02 * force[1], atol=1e-10)
         before, pushed = problem.momentum, pushed + bool(force[1] > 0.0)
+        if split and number == 10:
+            sticks, force = touch.sticks, problem.reaction(touch)
+            problem.split(np.arange(problem.bodies[0].num_global))
+            assert touch.sticks.dtype == bool  # numbers would choose points one and none
+            assert WORLD.allreduce(touch.sticks.sum()) == WORLD.allreduce(sticks.sum()) > 0
+            assert np.abs(problem.reaction(touch) - force).max() < 1e-12 * np.abs(force).max()
     history = problem.history
     assert pushed > 10 and problem.momentum[1] > 0.0
     assert history.cutbacks <= (0 if static else 1) and max(history.iterations) <= 6
@@ -168,11 +174,16 @@ def test_points_that_rub_across_a_kink_end_their_steps_on_the_facet_that_is_ther
     # Where they stayed beyond the end of one of before, the next step had another gap to begin
     # with: a force that grew as steps were halved, at bends of four degrees too.
     problem, touch = on_a_mat(1.5, 0.8, QUADRILATERAL, sideways=-0.8, scheme="conserving")
-    pushed = 0
-    for _ in problem.steps(time=0.5, dt=0.02):
+    block, pushed = problem.bodies[0], 0
+    for number, _ in enumerate(problem.steps(time=0.5, dt=0.02)):
         pushed += bool(problem.reaction(touch)[1] > 0.0)
+        if number == 10:
+            x = block.initial_domains.mean(axis=1)
+            lower = (np.abs(x[:, 0] - 0.5) > 0.3) & (x[:, 1] < 0.7)
+            both = WORLD.allgather(block.global_index[lower])
+            problem.split(np.sort(np.concatenate(both)))
     history = problem.history
-    assert pushed > 10 and problem.momentum[1] > 0.0
+    assert pushed > 10 and problem.momentum[1] > 0.0 and block.num_global == 22
     assert history.cutbacks <= 3 and max(history.iterations) <= 10
     assert energies(history).max() < 1.0 + 1e-9 and account(history) < 1e-10
 
@@ -329,14 +340,14 @@ def test_a_run_that_is_interrupted_leaves_everything_as_it_was():
         pass
     force = problem.reaction(touch)
     d = [body.displacement.x.array.copy() for body in problem.bodies]
-    before = {k: c.copy() for k, c in touch.columns(0).items()}
+    before = {k: c.values.copy() for k, c in touch.columns(0).items()}
     assert np.abs(force).max() > 0.0
     breaks(touch, lambda: problem.step(0.04))
     assert np.array_equal(force, problem.reaction(touch))
     for body, array in zip(problem.bodies, d, strict=True):
         assert np.array_equal(array, body.displacement.x.array)
     for key, column in touch.columns(0).items():
-        assert np.array_equal(before[key], column), key
+        assert np.array_equal(before[key], column.values), key
     other, again = colliding(0.3)
     problem.solve(time=0.32, dt=0.04)
     other.solve(time=0.32, dt=0.04)

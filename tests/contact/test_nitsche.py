@@ -226,6 +226,57 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
         third.restore(mpi_tmp_path / "half.ckpt")
 
 
+@pytest.mark.parametrize("what", ["split", "rebase"])
+def test_it_follows_other_meshes_of_the_body(what):
+    problem, die, path = dragged(law="nitsche")
+    for number, _ in enumerate(problem.steps(10, update=path)):
+        if number == 5:
+            before = told(die)
+            if what == "rebase":
+                problem.rebase()
+            else:
+                problem.split(np.arange(0, problem.particles.num_global, 2))
+            close(before, told(die), 1e-10)
+    other, alone, path = dragged(law="nitsche")
+    other.solve(10, update=path)
+    bound = 5e-2 if what == "split" else 1e-7
+    close({"reaction": die.reaction}, {"reaction": alone.reaction}, bound)
+    assert error_of_blocks(problem, step=1e-7, size=1e-5) < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("cell", "degree"),
+    [(QUADRILATERAL, 1), (TRIANGLE, 2), pytest.param(TRIANGLE, 3, marks=pytest.mark.slow)],
+)
+def test_a_body_that_is_rebased_goes_on_as_one_that_is_not(cell, degree):
+    # (curved facets of domains that are strained unevenly)
+    found = []
+    for rebased in (False, True):
+        V = scenes.vectors(scenes.box([0.0, -0.5], [2.0, 1.5], [4, 4], QUADRILATERAL), degree)
+        shape = scenes.bend(scenes.unit(4 if degree == 1 else 2, cell), 0.03)
+        particles = mpm.Particles(shape, V, degree=degree)
+        plane = contact.plane((0.0, 0.0), (0.0, 1.0))
+        ground = contact.Rigid(particles, plane, 0.3, law="nitsche")
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(
+                particles,
+                Hencky(1e3, POISSON),
+                body_force=(20.0, -50.0),
+                pressures=[(30.0, 1)],
+                facet_tags=scenes.facet_tags(shape, scenes.at(1, 1.0)),
+            ),
+            bcs=[scenes.fix(V, scenes.at(0, 0.0), component=0)],
+            terms=[ground],
+            solver=mpm.Solver(petsc_options={"snes_rtol": 1e-12}),
+        )
+        for _ in problem.steps(3):
+            if rebased:
+                problem.rebase()
+        found.append(outcome(problem) | {"reaction of the ground": ground.reaction})
+    assert np.abs(found[0]["deformation_gradient 0"] - np.eye(3)).max() > 0.05
+    same_run(found[1], found[0], 1e-9)
+
+
 @pytest.mark.parametrize("cell", ALL, ids=scenes.name)
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_extrapolation_of_stresses_is_exact_for_their_polynomials(cell, degree):

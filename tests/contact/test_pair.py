@@ -7,7 +7,7 @@ import pytest
 import scenes
 from compare import error_of_a_term, outcome, same_run
 from obstacles import on_plane
-from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_ranks, hertz, patch, spaces, two
+from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_meshes, hertz, patch, spaces, two
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
 from dolfinx import fem, mesh
@@ -217,8 +217,27 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
 
 
 @pytest.mark.slow
-def test_contact_follows_bodies_to_other_ranks():
-    go_on_other_ranks()
+@pytest.mark.parametrize("what", ["move", "rebase", "split"])
+def test_contact_follows_other_meshes_of_the_bodies(what):
+    go_on_other_meshes(what)
+
+
+def test_a_pair_of_a_body_that_is_split_goes_on_from_a_checkpoint(mpi_tmp_path):
+    cells = (QUADRILATERAL, QUADRILATERAL)
+    problem, touch, path = two(cells)
+    for number, _ in enumerate(problem.steps(8, update=path)):
+        if number == 4:
+            before = problem.reaction(touch)
+            problem.split(np.arange(0, problem.bodies[1].num_global, 3), body=1)
+            assert np.abs(problem.reaction(touch) - before).max() < 1e-8 * np.abs(before).max()
+        if number == 5:
+            problem.save(mpi_tmp_path / "split")
+    other, again, path = two(cells)
+    other.restore(mpi_tmp_path / "split")
+    other.solve(8, update=path)
+    end = problem.reaction(touch)
+    assert np.abs(other.reaction(again) - end).max() < 1e-9 * np.abs(end).max()
+    same_run(outcome(other), outcome(problem), 1e-9)
 
 
 @pytest.mark.parametrize("passes", [1, 2])

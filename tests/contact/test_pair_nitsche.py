@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import error_of_blocks, outcome, same_run
-from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_ranks, hertz, patch, spaces, two
+from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_meshes, hertz, patch, spaces, two
 from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
 
@@ -294,8 +294,9 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
 
 
 @pytest.mark.slow
-def test_it_follows_bodies_to_other_ranks():
-    problem = go_on_other_ranks(law="nitsche")
+@pytest.mark.parametrize("what", ["move", "rebase", "split"])
+def test_it_follows_other_meshes_of_the_bodies(what):
+    problem = go_on_other_meshes(what, law="nitsche")
     assert error_of_blocks(problem, step=1e-7, size=1e-5) < 1e-7
 
 

@@ -11,7 +11,7 @@ from scenes import QUADRILATERAL, WORLD, box
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import contact
-from mpm_dolfinx.io import Kept
+from mpm_dolfinx.io import Column, Kept
 from mpm_dolfinx.materials import Hencky
 
 TIGHT = {"petsc_options": {"snes_rtol": 1e-13}}
@@ -60,6 +60,43 @@ def in_all(which):
 def above(particles):
     """Return a plate that does not touch the block."""
     return contact.Rigid(particles, contact.plane((1.5, 1.02), (0.0, -1.0)))
+
+
+@pytest.mark.parametrize("axisymmetric", [False, True])
+def test_a_new_contact_knows_the_undeformed_areas_of_a_body_that_was_rebased(axisymmetric):
+    particles, base = soil()
+    options = {"axisymmetric": axisymmetric}
+    disc = contact.Rigid(particles, contact.disc(CENTRE, RADIUS), **options)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, Hencky(100.0, 0.3)), bcs=base, terms=[disc], **options
+    )
+    problem.solve(3, update=lambda t: disc.move((0.0, -0.1 * t)))
+    problem.rebase()
+    new = contact.Rigid(problem.particles, contact.disc((9.0, 9.0), 0.1), **options)
+    problem.stage(terms=[disc, new])
+    np.testing.assert_allclose(new.area, disc.area, rtol=1e-9)
+    stiffness = [one.kept()[0].columns(0)["thickness"].values for one in (new, disc)]
+    np.testing.assert_allclose(*stiffness, rtol=1e-9)
+
+
+def test_a_new_contact_knows_the_boundary_of_a_body_that_was_split():
+    """Diagonals that cuts have laid bare are none of it, and halves are as stiff as they were."""
+    problem, (disc,) = pressed()
+    before = {}
+    for cuts in ([], np.arange(0, 156, 4), [1]):
+        if len(cuts):
+            problem.split(cuts)
+        top = mpm.facet_tags(problem.particles.mesh, {1: mpm.region(y=1.0)})
+        far = contact.disc((9.0 + len(cuts), 9.0), 0.1)
+        new = contact.Rigid(problem.particles, far)
+        upper = contact.Rigid(problem.particles, far, facets=(top, 1))
+        problem.stage(terms=[disc, new, upper])
+        for name, one, length in (("disc", disc, 7.2), ("new", new, 7.2), ("upper", upper, 2.6)):
+            columns = one.kept()[0].columns(0)
+            area, height = columns["area"].values, columns["thickness"].values
+            assert WORLD.allreduce(area.sum()) == pytest.approx(length, rel=1e-12)
+            behind = WORLD.allreduce((area * height).sum())
+            assert behind == pytest.approx(before.setdefault(name, behind), rel=1e-12)
 
 
 def test_a_new_contact_begins_where_it_was_made():
@@ -221,11 +258,15 @@ def test_an_equal_pair_in_its_place_changes_nothing(law, passes, swapped):
 
 
 @pytest.mark.parametrize("law", ["penalty", "nitsche"])
-def test_equals_of_two_contacts_in_their_places_change_nothing(law):
+@pytest.mark.parametrize("split", [False, True])
+def test_equals_of_two_contacts_in_their_places_change_nothing(law, split):
+    """Also where one of them was made after the body was split, and has areas of its own."""
     found = []
     for replaced in (False, True):
         problem, discs = pressed(law)
         press(problem, discs)
+        if split:
+            problem.split(np.arange(3, 156, 6))
         other = contact.Rigid(problem.particles, contact.disc((0.6, 1.3), 0.3), 0.3, law=law)
         problem.stage(terms=[*discs, other])
         other.move((0.0, -0.03))
@@ -305,7 +346,7 @@ def test_what_is_asked_of_an_obstacle_outlives_a_stage():
     problem.solve(1)
     assert np.all(disc.offset == (0.0, -0.06))
     disc.move((0.0, -0.07))
-    problem.repartition(0.0)
+    problem.split(np.array([0]))
     problem.step()
     assert np.all(disc.offset == (0.0, -0.07))
 
@@ -380,7 +421,7 @@ class Worn(mpm.Term, Kept):
         if body is not None:
             return {}
         cells = self.bodies[0].V.mesh.topology.index_map(2).size_local
-        return {"steps": np.full((cells, 1), float(self.steps))}
+        return {"steps": Column(np.full((cells, 1), float(self.steps)), "cells")}
 
     def restore(self, taken):
         self.steps = taken.numbers["steps"]

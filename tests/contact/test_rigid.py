@@ -80,8 +80,10 @@ def test_a_block_between_plates_is_compressed_evenly(cell):
     assert scenes.largest(below.gap[here] + gap / area) < 1e-11
 
 
-@pytest.mark.parametrize("f_bar", ["none", "domain"])
-def test_a_cylinder_between_plates(f_bar):
+@pytest.mark.parametrize(
+    ("f_bar", "rebased"), [("none", False), ("domain", False), ("domain", True)]
+)
+def test_a_cylinder_between_plates(f_bar, rebased):
     strain = 0.01
     V = scenes.vectors(scenes.box([0.0, -0.3], [1.5, 1.5], [3, 4], QUADRILATERAL))
     particles = mpm.Particles(scenes.unit(4, QUADRILATERAL), V, quadrature_degree=2)
@@ -97,7 +99,10 @@ def test_a_cylinder_between_plates(f_bar):
     p = strain * YOUNG
     gap, area = p * 0.25 / CONFINED, (1.0 + 0.5 * POISSON * strain) ** 2
     half, whole = 0.5 * strain + gap, strain + 2.0 * gap / area
-    problem.solve(2, update=lambda t: above.move((0.0, -(whole if t == 1.0 else half))))
+    path = {0.5: half, 1.0: whole}
+    for number, _ in enumerate(problem.steps(2, update=lambda t: above.move((0.0, -path[t])))):
+        if rebased and number == 0:  # (on what has become wider)
+            problem.rebase()
     assert problem.reaction(below)[1] == pytest.approx(np.pi * p, rel=1e-8)
     assert problem.reaction(above)[1] == pytest.approx(-np.pi * p, rel=1e-8)
     assert scenes.largest(particles.stress[:, 1, 1] + p) < 1e-7 * p
@@ -198,7 +203,7 @@ def test_a_step_that_fails_leaves_everything_as_it_was():
         pass
     before = scenes.state(problem)
     points = {key: value.copy() for key, value in told(die).items()}
-    columns = {key: c.copy() for key, c in die.columns(0).items()}
+    columns = {key: c.values.copy() for key, c in die.columns(0).items()}
     die.move((0.0, -1.9))
     with pytest.raises(mpm.MPMError):
         problem.step()
@@ -206,7 +211,7 @@ def test_a_step_that_fails_leaves_everything_as_it_was():
     for key, value in told(die).items():
         assert np.array_equal(points[key], value), key
     for key, column in die.columns(0).items():
-        assert np.array_equal(columns[key], column), key
+        assert np.array_equal(columns[key], column.values), key
 
 
 def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
@@ -242,6 +247,25 @@ def test_contact_moves_with_the_particles_to_other_ranks():
     other.solve(10, update=still)
     close(told(die), told(alone), 1e-7)
     same_run(outcome(problem), outcome(other), 1e-8)
+
+
+@pytest.mark.parametrize("what", ["split", "rebase"])
+def test_contact_follows_other_meshes_of_the_body(what):
+    problem, die, path = dragged()
+    for number, _ in enumerate(problem.steps(10, update=path)):
+        if number == 5:
+            before = told(die)
+            if what == "rebase":
+                problem.rebase()
+            else:
+                problem.split(np.arange(0, problem.particles.num_global, 2))
+            after = told(die)
+            close(before, after, 1e-10)
+    other, alone, path = dragged()
+    other.solve(10, update=path)
+    close({"reaction": die.reaction}, {"reaction": alone.reaction}, 3e-2)
+    if what == "rebase":
+        close(told(die), told(alone), 1e-6)
 
 
 @pytest.mark.parametrize("method", ["cpdi2", "cpdi", "gimp", "mpm"])

@@ -323,8 +323,8 @@ def test_what_nothing_holds_is_told():
     assert not plate.offset.any()
 
 
-def test_it_touches_several_bodies_and_goes_with_plasticity():
-    # Hit by a tool, two bodies on fields of their own.
+def test_it_touches_several_bodies_and_goes_with_splitting_and_plasticity():
+    # Hit by a tool, two bodies on fields of their own; some domains are split on the way.
     grid = box([-0.8, -0.6], [1.8, 1.0], [10, 6], QUADRILATERAL)
     halves = [box([a, 0.0], [a + 0.5, 0.5], [4, 4], QUADRILATERAL) for a in (0.0, 0.5)]
     bodies = [mpm.Particles(half, scenes.vectors(grid)) for half in halves]
@@ -349,6 +349,8 @@ def test_it_touches_several_bodies_and_goes_with_plasticity():
     momentum = problem.momentum + tool.momentum
     for _ in problem.steps(time=0.2, dt=0.02):
         assert np.abs(problem.momentum + tool.momentum - momentum).max() < 1e-12
+        if problem.history.time == pytest.approx(0.1):
+            problem.split(np.arange(0, bodies[0].num_global, 2))
     assert [bool(np.abs(c.reaction).max() >= 0.0) for c in tool.contacts] == [True, True]
     assert tool.velocity[1] > -1.2
 

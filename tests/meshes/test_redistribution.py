@@ -19,6 +19,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx import _compat
 from mpm_dolfinx.meshes.cells import disconnected_mesh
 from mpm_dolfinx.meshes.redistribution import Redistribution
+from mpm_dolfinx.meshes.remesh import Remesh
 
 SELF = MPI.COMM_SELF
 
@@ -79,20 +80,33 @@ def moved_thrice(body):
     return carrier
 
 
-def tagged(tags, domain, tag):
-    """Integrate over what has a tag, by one form for all tags."""
+def moved_and_stretched(body):
+    """To other ranks, then to other places, then to other ranks."""
+    carrier = moved_once(body)
+    between = carrier.mesh
+    nodes = _compat.geometry_dofmap(between)[: len(anywhere(between))]
+    x = between.geometry.x[nodes][:, :, : between.geometry.dim]
+    carrier = carrier.then(Remesh(between, np.zeros((0, 2), dtype=np.int64), 2.0 * x))
+    return carrier.then(Redistribution(carrier.mesh, anywhere(carrier.mesh, 2)))
+
+
+def tagged(tags, domain, tag, size):
+    """Integrate over what has a tag, in a mesh as it was before it was stretched to a size.
+
+    One form serves all tags and sizes, which are no part of it.
+    """
     here = np.sort(tags.find(tag))
     alone = mesh.meshtags(domain, tags.dim, here, np.ones(len(here), dtype=np.int32))
     kind = "dx" if tags.dim == domain.topology.dim else "ds"
-    x = ufl.SpatialCoordinate(domain)
+    x = ufl.SpatialCoordinate(domain) * fem.Constant(domain, 1.0 / size)
     measure = ufl.Measure(kind, domain=domain, subdomain_data=alone)
     form = fem.form((1.0 + x[0] + 3.0 * x[1]) * measure(1))
-    return WORLD.allreduce(fem.assemble_scalar(form))
+    return WORLD.allreduce(fem.assemble_scalar(form)) / size**tags.dim
 
 
 @pytest.mark.parametrize(
     ("way", "apart", "cell"),
-    thinned(4, product([moved_once, moved_thrice], [False, True], ALL)),
+    thinned(5, product([moved_once, moved_thrice, moved_and_stretched], [False, True], ALL)),
     ids=scenes.name,
 )
 def test_tags_and_functions_move(way, apart, cell):
@@ -104,14 +118,16 @@ def test_tags_and_functions_move(way, apart, cell):
     values = fem.Function(fem.functionspace(body, ("DG", 0)), name="stiffness")
     values.interpolate(lambda x: 1.0 + x[0] + 2.0 * x[1])
     move = way(body)
+    scale = 2.0 if way is moved_and_stretched else 1.0
     moved = [move.carry(thing) for thing in (facets, cells, values)]
     for old, new in zip((facets, cells), moved, strict=False):
         for tag in (1, 2, 3):
-            one, two = tagged(old, body, tag), tagged(new, move.mesh, tag)
+            one, two = tagged(old, body, tag, 1.0), tagged(new, move.mesh, tag, scale)
             assert two == pytest.approx(one, rel=1e-12, abs=1e-14)
     one, two = (
         WORLD.allreduce(fem.assemble_scalar(fem.form(f**2 * ufl.SpatialCoordinate(m)[0] * ufl.dx)))
-        for f, m in ((values, body), (moved[2], move.mesh))
+        / size ** (body.topology.dim + 1)
+        for f, m, size in ((values, body, 1.0), (moved[2], move.mesh, scale))
     )
     assert two == pytest.approx(one, rel=1e-12) and moved[2].name == "stiffness"
     if move.mesh is not body:

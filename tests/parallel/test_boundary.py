@@ -17,7 +17,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import boundary, contact, io, plot
-from mpm_dolfinx.io import Kept, fill, of_cells
+from mpm_dolfinx.io import Column, Kept, fill, of_cells
 from mpm_dolfinx.materials import Fracture, Hencky, NeoHooke, VonMises
 from mpm_dolfinx.parallel.boundary import Hooked, collective, hooks_of, is_collective
 from mpm_dolfinx.system.schemes import Euler
@@ -240,7 +240,7 @@ class Own(Kept):
 
     def columns(self, body):
         self.fail("columns")
-        return {} if body is None else {"v": of_cells(self.values)}
+        return {} if body is None else {"v": Column(of_cells(self.values), "nodes")}
 
     def numbers(self):
         self.fail("numbers")
@@ -333,6 +333,7 @@ WRONG = {
     "unknown": lambda: made(**differing({}, {"foo": 1})),
     "nothing": lambda: made().remove(differing([0], None)),
     "function": lambda: made().remove(lambda x: [][LAST] if LAST else x[0] < 0.4),
+    "no indices": lambda: made().split(differing([0], "abc")),
     "no particles": lambda: mpm.Body(differing(particles(), None), Hencky(1e3, 0.3)),
     "no body": lambda: mpm.QuasiStaticProblem(
         differing(mpm.Body(particles(), Hencky(1e3, 0.3)), None)

@@ -79,6 +79,12 @@ def repartitioned():
     problem.solve(1)
 
 
+def split():
+    problem = scenes.block(cell=scenes.QUADRILATERAL, force=(0.0, -1.0))
+    problem.split([0])
+    problem.solve(1)
+
+
 def on_reference_route():
     with on_route("reference"):
         scenes.block(f_bar="patch", tractions=[]).solve(1)
@@ -181,7 +187,7 @@ def staged():
 
 
 KINDS = {
-    **{f.__name__: f for f in (loaded, repartitioned, on_reference_route, moving, staged)},
+    **{f.__name__: f for f in (loaded, repartitioned, split, on_reference_route, moving, staged)},
     **{f.__name__: f for f in (with_a_pressure, with_water, under_a_footing)},
     **{f"pressed, {law}": partial(pressed, law) for law in ("penalty", "nitsche")},
     "a pair": partial(two_bodies, contact.Pair),

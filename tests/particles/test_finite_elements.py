@@ -245,6 +245,7 @@ def test_what_makes_no_sense():
         ({"degree": 2, "quadrature_degree": 3}, "quadrature_degree=4 or more"),
         ({"degree": 4}, "must be 1, 2 or 3"),
         ({"outside": "delete"}, "no background to leave"),
+        ({"on_distortion": "split"}, "can be split"),
         ({"V": vectors(body)}, "or omit it for finite elements"),
     ):
         raises(partial(mpm.Particles, body, **options), mpm.MPMError, sentence)
@@ -256,3 +257,5 @@ def test_what_makes_no_sense():
     )
     problem = mpm.QuasiStaticProblem(own, bcs=[mpm.held(free.W, where=at(1, 0.0))])
     problem.solve(1)
+    raises(problem.rebase, mpm.MPMError, "Only a body that moves by 'cpdi2'")
+    raises(lambda: problem.split([0]), mpm.MPMError, "can be split")

@@ -18,8 +18,7 @@ import ufl
 from dolfinx import fem
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.meshes.cells import input_cell_index
-from mpm_dolfinx.meshes.redistribution import Carrier
+from mpm_dolfinx.meshes.remesh import Remesh
 
 
 def far_corner(scale):
@@ -320,16 +319,11 @@ def test_stretched_domain_has_the_polar_parts_of_its_motion():
 def test_tags_of_the_first_mesh_and_of_the_last_eight_are_carried():
     """Each mesh that is known holds communicators, of which there are not many."""
     V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
-
-    def body():
-        return scenes.box([0.2, 0.2], [1.2, 1.2], [3, 3], QUADRILATERAL)
-
-    particles, every = mpm.Particles(body(), V), []
+    particles = mpm.Particles(scenes.box([0.2, 0.2], [1.2, 1.2], [3, 3], QUADRILATERAL), V)
+    every, none = [], np.zeros((0, 2), dtype=np.int64)
     for _ in range(12):
         every.append(mpm.facet_tags(particles.mesh, {7: mpm.region(x=0.2)}))
-        before, after = particles.mesh, body()
-        numbers = np.asarray(before.geometry.input_global_indices, dtype=np.int64)
-        particles.live_on(Carrier(before, after, input_cell_index(after), numbers))
+        particles.live_on(Remesh(particles.mesh, none), none)
     present = mpm.facet_tags(particles.mesh, {7: mpm.region(x=0.2)})
     own = particles.mesh.topology.index_map(1).size_local
     for number, tags in enumerate(every):
@@ -340,3 +334,11 @@ def test_tags_of_the_first_mesh_and_of_the_last_eight_are_carried():
             assert np.array_equal(found, here)
         else:
             assert carried is tags, number
+
+
+def test_a_body_that_is_dealt_out_anew_at_first_was_not_rebased():
+    V = scenes.vectors(scenes.box([0.0, 0.0], [2.0, 2.0], [4, 4], QUADRILATERAL))
+    block = scenes.box([0.2, 0.2], [1.2, 1.2], [3, 3], QUADRILATERAL)
+    moved = mpm.Particles(block, V)
+    moved.repartition()
+    assert moved.trail.rebases == 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from marks import all_but
-from posed import posed
+from posed import posed, staged
 from routes import ROUTES
 from scenes import QUADRILATERAL, TRIANGLE, gather
 
@@ -102,6 +102,28 @@ def test_uniform_compression(name, take):
     options = dict(CASES[name])
     take(options.pop("route", "loops"))
     assert unevenness(pressed(**options)) < 1e-9
+
+
+@pytest.mark.parametrize("options", [{}, {"route": "reference"}, {"f_bar": "patch"}], ids=str)
+def test_uniform_compression_goes_on_after_a_rebase(options, take):
+    options = dict(options)
+    take(options.pop("route", "loops"))
+    problem = pressed(bent=True, force=60.0, **options)
+    problem.rebase()
+    before = scenes.in_order(problem.particles, problem.particles.stress)
+    problem.step()
+    assert unevenness(problem, 60.0) < 1e-9
+    np.testing.assert_allclose(
+        scenes.in_order(problem.particles, problem.particles.stress), before, atol=1e-9 * 60.0
+    )
+    plain = pressed(force=60.0, bent=True, **options)
+    for one in (problem, plain):
+        staged(one, tractions=[((0.0, -90.0), TOP)])
+        one.solve(2)
+    assert unevenness(problem, 90.0) < 1e-9
+    np.testing.assert_allclose(
+        problem.particles.centroid, plain.particles.centroid, rtol=0, atol=1e-10
+    )
 
 
 @pytest.mark.parametrize("law", ["penalty", "nitsche"])

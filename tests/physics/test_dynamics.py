@@ -903,6 +903,105 @@ def mesh_comm():
     return MPI.COMM_SELF
 
 
+@pytest.mark.parametrize(
+    ("out", "scheme"),
+    [("project", "midpoint"), ("reflect", "midpoint"), ("project", "conserving")],
+)
+def test_split_and_rebase_keep_momentum(out, scheme):
+    problem = thrown(out=out, scheme=scheme)
+    problem.solve(time=0.2, dt=0.05)
+    expected = problem.momentum
+    problem.split([3, 17, 40])
+    np.testing.assert_allclose(problem.momentum, expected, atol=1e-12)
+    problem.rebase()
+    np.testing.assert_allclose(problem.momentum, expected, atol=1e-12)
+    turning = problem.angular_momentum
+    history = problem.solve(time=0.4, dt=0.05)
+    np.testing.assert_allclose(problem.momentum, expected - [0.0, 0.2 * 2.0], atol=1e-11)
+    if scheme == "conserving":  # the weight turns it about the origin
+        turned = problem.angular_momentum - turning
+        centre = np.trapezoid([1.73, 1.73], dx=0.2)
+        np.testing.assert_allclose(turned, -2.0 * centre, atol=1e-10)
+    assert change_of_balance(history) < 1e-9
+
+
+@pytest.mark.parametrize(("cell", "degree"), [(TRIANGLE, 3), (QUADRILATERAL, 2)])
+def test_a_rebase_keeps_kinetic_energy(cell, degree):
+    # A body that shears by as much as its size: cells with curved sides, far from what they were.
+    def torn(x):
+        return np.stack([2.0 * np.sin(3.0 * x[1]), 1.5 * np.cos(4.0 * x[0])])
+
+    body = box([1.23, 1.51], [2.23, 2.51], [2, 2], cell)
+    particles = mpm.Particles(body, plate(degree=degree), degree=degree)
+    problem = spinning(particles, velocity=torn)
+    problem.solve(time=0.2, dt=0.05)
+    strain = np.abs(particles.deformation_gradient - np.eye(3)).max(initial=0.0)
+    assert WORLD.allreduce(strain, MPI.MAX) > 0.3
+    before = problem.kinetic_energy, *problem.momentum
+    problem.rebase()
+    after = problem.kinetic_energy, *problem.momentum
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-13 * before[0])
+    problem.solve(time=0.3, dt=0.05)
+    assert change_of_balance(problem.history) < 1e-9
+
+
+@pytest.mark.parametrize("options", [{"f_bar": "patch"}, {"axisymmetric": True}], ids=str)
+def test_a_motion_goes_on_as_it_was_after_a_rebase(options):
+    # A tube or a block that widens, pulled back by its stiffness.
+    runs = []
+    for rebased in (False, True):
+        problem = spinning(velocity=lambda x: 0.3 * x[:2], scheme="conserving", **options)
+        problem.solve(time=0.2, dt=0.05)
+        if rebased:
+            problem.rebase()
+        problem.solve(time=0.4, dt=0.05)
+        assert change_of_balance(problem.history) < 1e-9
+        runs.append(problem)
+    one, two = runs
+    assert one.history.iterations == two.history.iterations
+    places = [in_order(run.particles, run.particles.domains) for run in runs]
+    np.testing.assert_allclose(places[1], places[0], rtol=0, atol=1e-9)
+    assert np.abs(one.particles.deformation_gradient - np.eye(3)).max(initial=0.0) > 0.01
+
+
+@pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])
+def test_a_split_between_two_steps_keeps_momentum(scheme):
+    # The forces at the beginning of the next step are those of before.
+    problem = thrown(scheme=scheme, petsc_options={"snes_rtol": 1e-12})
+    expected = problem.momentum
+    for step in problem.steps(time=0.3, dt=0.05):
+        if step.time == pytest.approx(0.15):
+            problem.split(np.arange(0, problem.particles.num_global, 2))
+        fallen = [0.0, step.time * 2.0]
+        np.testing.assert_allclose(problem.momentum, expected - fallen, atol=1e-11)
+
+
+@pytest.mark.parametrize("what", ["split", "rebase"])
+@pytest.mark.parametrize("damping", [0.0, 1e-3])
+def test_other_meshes_between_two_steps_are_no_other_run(what, damping):
+    # Stresses of whole steps know what the new mesh is strained by, also within one run.
+    def change(problem):
+        if what == "rebase":
+            problem.rebase()
+        else:
+            problem.split(np.arange(0, problem.particles.num_global, 2))
+
+    runs = []
+    for once in (True, False):
+        problem = thrown(scheme="conserving", rayleigh=(0.0, damping))
+        if once:
+            for step in problem.steps(time=0.3, dt=0.05):
+                if step.time == pytest.approx(0.15):
+                    change(problem)
+        else:
+            problem.solve(time=0.15, dt=0.05)
+            change(problem)
+            problem.solve(time=0.3, dt=0.05)
+        assert change_of_balance(problem.history) < 1e-9
+        runs.append(problem.particles)
+    assert np.abs(runs[0].domains - runs[1].domains).max(initial=0.0) < 1e-9
+
+
 def test_two_bodies_collide_on_one_background():
     # No momentum is lost, and they part by themselves.
     V = vectors(box([-1.0, 0.0], [4.0, 1.5], [20, 6], QUADRILATERAL))

@@ -512,15 +512,24 @@ def wet(frame):
 
 
 def staged(frame):
-    """A block whose load and law change, and which is excavated."""
+    """A block whose load and law change, which is cut, and which is excavated."""
     scene = weight(frame)
     problem = scene.made
+    problem.rebase()
     staged_with(problem, material=materials.Hencky(0.5 * YOUNG * frame.stress, 0.2))
     problem.solve(2)
     corner = frame.point([1.6, 1.55])
     size = 0.6 * frame.length
     problem.remove(lambda x: np.hypot(x[0] - corner[0], x[1] - corner[1]) < size)
     problem.solve(2)
+    return scene
+
+
+def split(frame):
+    """A block with domains that are cut."""
+    scene = weight(frame)
+    scene.made.split([3, 17])
+    scene.made.step()
     return scene
 
 
@@ -717,6 +726,7 @@ SCENES = {
     "euler": of(moving, scheme="euler"),
     "water": wet,
     "stages": staged,
+    "split": split,
     "geostatic": level,
     "displacement control": controlled,
     "automatic steps": automatic,

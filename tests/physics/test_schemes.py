@@ -173,7 +173,9 @@ def test_what_a_scheme_keeps_goes_with_bodies_to_other_ranks_and_meshes():
     flying.inertia.velocities[0].x.array[:] = np.tile(
         [0.37, 0.0], len(flying.velocity.x.array) // 2
     )
-    for _ in range(6):
+    for number in range(6):
+        if number == 3:
+            flying.split([0, 1, 40])
         flying.step(0.05)
     moved = flying.particles.displacement.x.array.reshape(-1, 2) - [0.37 * 0.3, 0.0]
     assert largest(moved) < 1e-12

@@ -285,6 +285,10 @@ PROBLEMS = {
         problem(body_force=(True, -1.0)),
         r"body_force must be numbers",
     ),
+    "indices that are true": (
+        lambda: scenes.block().split([True]),
+        r"global indices, whole numbers, not \[True\]",
+    ),
     "removed by truths": (
         lambda: scenes.block().remove([True, False]),
         r"whole numbers, or a function of coordinates, not \[True, False\]",
@@ -542,7 +546,7 @@ def test_older_of_two_problems():
     p = particles()
     older = mpm.QuasiStaticProblem(mpm.Body(p, Hencky(1e3, 0.3)))
     newer = mpm.QuasiStaticProblem(mpm.Body(p, Hencky(1e3, 0.3)))
-    for call in (older.solve, older.step, older.repartition, lambda: older.write("a.pvd")):
+    for call in (older.solve, older.step, older.rebase, lambda: older.write("a.pvd")):
         raises(call, mpm.MPMError, "^Another problem was made of these particles since")
     newer.solve(steps=1)
     raises(older.step, mpm.MPMError, "^Another problem was made of these particles since")

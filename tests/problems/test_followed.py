@@ -12,7 +12,6 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, VonMises
-from mpm_dolfinx.meshes.redistribution import Redistribution
 
 
 def column(material, **options):
@@ -141,7 +140,6 @@ def test_arrays_are_copied():
     assert scenes.largest(gap) < 1e-12
 
 
-@pytest.mark.skipif(WORLD.size == 1, reason="on one rank a body keeps its mesh")
 def test_a_function_on_a_mesh_that_was_left_is_refused():
     held = {}
 
@@ -156,9 +154,7 @@ def test_a_function_on_a_mesh_that_was_left_is_refused():
         bcs=[fix(V, at(0, 0.0), component=0), fix(V, at(1, 0.0), component=1)],
     )
     problem.solve(1)
-    (body,) = problem.bodies
-    move = Redistribution(body.mesh, scenes.anywhere(body.mesh))
-    problem.state.renew(lambda: body.live_on(move), lambda state: state)
+    problem.split([3])
     problem.step()
     held["young"].x.array[:] = 400.0
     with pytest.raises(mpm.MPMError, match=r"'stiffness'.* mesh that the particles have left"):

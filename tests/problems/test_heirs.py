@@ -13,7 +13,7 @@ from dolfinx import fem, la
 from dolfinx.fem import petsc as fem_petsc
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.io import Kept, fill, of_cells
+from mpm_dolfinx.io import Column, Kept, fill, of_cells
 from mpm_dolfinx.materials import VonMises
 
 BEDDING = 40.0
@@ -23,7 +23,7 @@ class Bedding(mpm.Term, Kept):
     """Springs in the volume that give way: half of their stretch is gone after each step."""
 
     key = "bedding"
-    movable = True
+    movable = remeshable = True
 
     def __init__(self, particles):
         super().__init__([particles])
@@ -38,7 +38,7 @@ class Bedding(mpm.Term, Kept):
         return [self]
 
     def columns(self, body):
-        return {} if body is None else {"anchor": of_cells(self.anchor)}
+        return {} if body is None else {"anchor": Column(of_cells(self.anchor), "nodes")}
 
     def restore(self, taken):
         (columns, _) = taken.columns
@@ -133,6 +133,39 @@ def test_an_heir_goes_on_on_other_meshes_and_from_files(mpi_tmp_path):
     assert other.count == 4
     same_run(outcome(other), outcome(whole), 1e-9)
     np.testing.assert_allclose(anchors(other), anchors(whole), atol=1e-11)
+
+    # Split and rebased between steps: anchors stay where they are, the motion is about the same.
+    cut = made()
+    for number, _ in enumerate(cut.steps(4)):
+        if number == 1:
+            before = anchors(cut)
+            cut.split([3, 20])
+            assert cut.particles.num_global == 38
+            kept = np.setdiff1d(np.arange(36), [3, 20])
+            assert np.array_equal(anchors(cut)[kept], before[kept])
+            assert {tuple(a) for cell in anchors(cut)[[3, 20, 36, 37]] for a in cell} == {
+                tuple(a) for cell in before[[3, 20]] for a in cell
+            }
+        if number == 2:
+            cut.save(mpi_tmp_path / "cut.ckpt")
+    assert cut.count == 4 and type(cut) is Bedded and cut.terms == [cut.bedding]
+    sag, wanted = (np.abs(anchors(p)[:36]).max() for p in (cut, whole))
+    assert sag == pytest.approx(wanted, rel=0.02) and wanted > 1e-3
+    resumed = made()
+    resumed.restore(mpi_tmp_path / "cut.ckpt")
+    assert resumed.count == 3
+    resumed.solve(steps=4)
+    same_run(outcome(resumed), outcome(cut), 1e-9)
+    np.testing.assert_allclose(anchors(resumed), anchors(cut), atol=1e-11)
+
+    # Rebased: displacements, and with them anchors, are counted from new positions.
+    total = scenes.in_order(cut.particles, cut.particles.domains)
+    cut.rebase()
+    assert cut.count == 4
+    now = scenes.in_order(cut.particles, cut.particles.domains)
+    np.testing.assert_allclose(now, total, atol=1e-14)
+    assert not cut.particles.displacement.x.array.any()
+    assert len(anchors(cut)) == 38
 
 
 def test_what_is_derived_from_what_all_problems_have_is_refused():

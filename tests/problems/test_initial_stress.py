@@ -4,6 +4,7 @@
 
 import numpy as np
 import pytest
+from compare import outcome, same_run
 from posed import posed
 from scenes import (
     HEXAHEDRON,
@@ -22,6 +23,7 @@ from scenes import (
 )
 
 import ufl
+from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
@@ -127,11 +129,11 @@ def off_the_lines(cell, **options):
 )
 def test_averages_leave_level_ground_at_rest_whatever_comes_after(cell, options, mpi_tmp_path):
     problem = off_the_lines(cell, **options)
-    for change in ("begin", "stage", "repartition", "restore"):
+    for change in ("begin", "stage", "rebase", "repartition", "restore"):
         if change == "stage":
             problem.stage("equal", problem.body().replace(material=LAWS[4].with_parameters()))
-        elif change == "repartition":
-            problem.repartition(0.0)
+        elif change in ("rebase", "repartition"):
+            getattr(problem, change)()
         elif change == "restore":
             problem = off_the_lines(cell, **options)
             problem.solve(1)
@@ -311,3 +313,58 @@ def test_goes_with_the_body(law, mpi_tmp_path):
     )
     other.repartition(0.0)
     stays(other)
+    other.split([3, 17])
+    other.step()
+    assert largest(np.abs(other.bodies[0].displacement.x.array)) <= 1e-12 * HEIGHT
+
+
+def punched(water):
+    """Return ground that a rigid punch presses, with water in it or without, and its path."""
+    degree = 2 if water else 1
+    V = vectors(box([0, 0], [4, 6], [4, 6], QUADRILATERAL), degree)
+    ground = box([0, 0], [4, HEIGHT], [8 // degree, 10 // degree], QUADRILATERAL)
+    body = mpm.Particles(ground, V, degree=degree)
+    way = fem.Constant(V.mesh, np.zeros(2))
+    under = fem.locate_dofs_geometrical(V, lambda x: (x[1] > 4.9) & (x[0] < 1.1))
+    bcs = [
+        fix(V, at(0, 0, 4), component=0),
+        fix(V, at(1, 0), component=1),
+        fem.dirichletbc(way, under, V),
+    ]
+    given = {"density": DENSITY, "body_force": GRAVITY, "bcs": bcs}
+    given |= {"petsc_options": {"snes_rtol": 1e-11}}
+    given["initial_stress"] = mpm.geostatic(HEIGHT, DENSITY, 0.5, GRAVITY)
+    law = materials.MohrCoulomb(YOUNG, 0.3, cohesion=5.0, friction_angle=30.0)
+    if not water:
+        problem = posed(mpm.QuasiStaticProblem, body, law, **given)
+        return problem, lambda: problem.steps(4, update=lambda t: np.put(way.value, 1, -0.1 * t))
+    tags = facet_tags(body.mesh, at(1, HEIGHT))
+    drained = {"facet_tags": tags, "drained": [(0.0, 1)], "permeability": 1e-3, "storage": 1e-4}
+    problem = posed(mpm.PorousProblem, body, law, **given, **drained)
+    return problem, lambda: problem.steps(
+        time=0.4, dt=0.1, update=lambda t: np.put(way.value, 1, -0.25 * t)
+    )
+
+
+@pytest.mark.parametrize("water", [False, True])
+def test_ground_that_is_rebased_goes_on_as_ground_that_is_not(water, mpi_tmp_path):
+    straight, steps = punched(water)
+    for _ in steps():
+        pass
+    problem, steps = punched(water)
+    for number, _ in enumerate(steps()):
+        if number in (0, 2):
+            problem.rebase()
+            assert largest(problem.bodies[0].displacement.x.array) == 0.0
+        if number == 1:
+            problem.repartition(0.0)
+        if number == 2:
+            problem.save(mpi_tmp_path / "rebased")
+    other, steps = punched(water)
+    other.restore(mpi_tmp_path / "rebased")
+    for _ in steps():
+        pass
+    assert largest(straight.bodies[0].plastic_strain) > 1e-3
+    for each in (problem, other):
+        assert each.history.iterations == straight.history.iterations
+        same_run(outcome(each), outcome(straight), 1e-9)

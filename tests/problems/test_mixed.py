@@ -450,11 +450,56 @@ def test_a_stabilised_pressure_goes_on_from_a_file_and_on_other_meshes(mpi_tmp_p
     run = moved.steps(4)
     next(run)
     next(run)
+    moved.rebase()
     moved.repartition(0.0)
     for load in (0.75, 1.0):
         moved.particles.load.value = load
         moved.step()
     same_run(outcome(moved), outcome(whole), 1e-8)
+
+
+def test_a_split_carries_the_pressure():
+    problem = simple()
+    body, which = problem.particles, [3, 5, 10]
+    body.load.value = 0.5
+    problem.step()
+
+    def state():
+        (p,) = problem.pressure
+        values = p.x.array[: body.num_local].copy()
+        return [scenes.in_order(body, a) for a in (values, body.stress)]
+
+    before, force = state(), problem.reaction(problem.bcs[0])
+    problem.split(which)
+    origin = scenes.in_order(body, body.origin_index)
+    for now, values in zip(state(), before, strict=True):
+        size = np.abs(values).max()
+        assert size > 0.1
+        np.testing.assert_allclose(now, values[origin], rtol=0.0, atol=1e-12 * size)
+    np.testing.assert_allclose(problem.reaction(problem.bcs[0]), force, rtol=1e-12)
+    body.load.value = 1.0
+    problem.step()
+    held = problem.reaction(problem.bcs[0])
+    np.testing.assert_allclose(held, [0.0, 0.1 * 2.0 * 0.5], rtol=0.0, atol=1e-8)
+
+
+def test_a_body_that_is_split_at_first_is_one_of_triangles():
+    tight = {"petsc_options": {"snes_rtol": 1e-12}}
+    cut, plain = simple(**tight), simple(cell=TRIANGLE, diagonal="right", **tight)
+    cut.split(range(16))
+    cut.particles.undeformed.mass_share.x.array[:] = (
+        1.0  # masses of triangles, not of quadrilaterals
+    )
+    ends = []
+    for problem in (cut, plain):
+        problem.solve(2)
+        body = problem.particles
+        x = scenes.in_order(body, body.domains).reshape(-1, 2)
+        ends.append(
+            np.concatenate([x.min(axis=0), x.max(axis=0), problem.reaction(problem.bcs[0])])
+        )
+    assert ends[0][1] < 0.57
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0.0, atol=1e-9)
 
 
 # -- Soils -------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky, LinearElastic, SmallStrainVonMises, VonMises
+from mpm_dolfinx.particles.field import CarriedField
 from mpm_dolfinx.plot.fields import values_of
 
 SOIL = LinearElastic(1e3, 0.25)
@@ -533,6 +534,42 @@ def soaked(comm=WORLD, **options):
     return posed(mpm.PorousProblem, body, defaults.pop("material", Hencky(10.0, 0.3)), **defaults)
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        pytest.param({"material": LinearElastic(30.0, 0.3)}, marks=pytest.mark.slow),
+        pytest.param({"axisymmetric": True}, marks=pytest.mark.slow),
+    ],
+    ids=["finite", "small", "around an axis"],
+)
+def test_a_rebased_body_goes_on_as_one_that_is_not(options):
+    results = []
+    for changes in (False, True):
+        problem = soaked(**options)
+        problem.solve(time=0.2, dt=0.1)
+        if changes:
+            problem.rebase()
+            assert scenes.largest(problem.particles.displacement.x.array) == 0.0
+        problem.solve(time=0.3, dt=0.1)
+        if changes:
+            problem.repartition(0.0)
+            problem.rebase()
+        problem.solve(time=0.4, dt=0.1)
+        (p,) = problem.pore_pressure
+        where = CarriedField(p).converged_nodes()
+        own = p.W.dofmap.list[: problem.particles.num_local]
+        values = {
+            "pressure": scenes.in_order(problem.particles, p.x.array[own]),
+            "places": scenes.in_order(problem.particles, where[own]),
+        }
+        results.append(outcome(problem) | values)
+        assert problem.history.iterations == results[0].setdefault("", problem.history.iterations)
+    assert np.abs(results[0]["deformation_gradient 0"] - np.eye(3)).max() > 0.05
+    del results[0][""]
+    same_run(results[1], results[0], 1e-9)
+
+
 @pytest.mark.parametrize("name", ["permeability", "storage", "drained", "inflow"])
 def test_what_lies_on_the_mesh_of_before_is_refused(name):
     body = soaked().particles
@@ -547,8 +584,8 @@ def test_what_lies_on_the_mesh_of_before_is_refused(name):
     law = Hencky(10.0, 0.3)
     problem = posed(mpm.PorousProblem, again, law, facet_tags=tags, bcs=held, **given)
     before = scenes.state(problem)
-    with pytest.raises(mpm.MPMError, match=f"{name} is written on the present body mesh"):
-        problem.repartition(0.0)
+    for change in (problem.rebase, lambda: problem.repartition(0.0)):
+        raises(change, mpm.MPMError, f"{name} is written on the present body mesh")
     scenes.assert_same_state(before, scenes.state(problem))
 
 

@@ -158,6 +158,8 @@ def block(law=None, kind=mpm.QuasiStaticProblem, **options):
 
 
 CHANGES = {
+    "split": lambda problem: problem.split([0]),
+    "rebase": lambda problem: problem.rebase(),
     "repartition": lambda problem: problem.repartition(0.0),
     "stage": lambda problem: problem.stage(bodies=problem.body().replace(body_force=(0.0, -4.0))),
     "remove": lambda problem: problem.remove(lambda x: (x[0] > 1.5) & (x[1] > 1.5)),
@@ -348,6 +350,17 @@ def test_interrupted_reduction_leaves_the_last_state_that_counts(ends, limit):
     assert problem.points[0] is law and len(problem.history.steps) == here["steps"]
     problem.step()  # and with the strength that was given it stands there
     np.testing.assert_allclose(problem.particles.converged_displacement, here["d"], atol=1e-6)
+
+
+def test_domains_that_may_be_split_are_refused():
+    problem = block(on_distortion="split")
+    problem.solve(2)
+    with pytest.raises(mpm.MPMError, match="which a split of domains changes"):
+        mpm.strength_reduction(problem)
+    problem.particles.on_distortion = "error"
+    found = mpm.strength_reduction(problem, tolerance=0.1, most=1.2, displacement=np.inf)
+    assert found.factor == 1.2 and found.above == found.limit == np.inf
+    assert found.reason == "most"
 
 
 def test_a_law_without_strength_is_refused():

@@ -383,6 +383,36 @@ def test_particles_move_to_other_ranks_within_a_run():
 # -- Bad input ---------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("point", [(0.5, 1.0), (0.0, 1.0), (0.375, 1.0), (0.47, 0.99)])
+def test_point_of_split_domains(point):
+    # Corners of halves too, where the map of a quadrilateral with two corners in one is singular.
+    problem, _ = bar(Hencky(1e3, 0.3), 5.0, 2.0)
+    body = problem.particles
+    problem.split(np.arange(body.num_global))
+    control = mpm.DisplacementControl(body, 1.0, point, (0.0, 1.0))
+    row = control.row().array_r.reshape(-1, 2)[:, 1]
+    x = body.W.tabulate_dof_coordinates()[: len(row), :2]
+    found = WORLD.allreduce(np.array([row.sum(), *(row @ x)]))
+    np.testing.assert_allclose(found, [1.0, *point], rtol=0.0, atol=1e-14)
+    problem.solve(steps=2, control=control)
+    stretch = 1.0 + 1.0 / point[1]
+    load = 1e3 / (1.0 - 0.3**2) * np.log(stretch) / stretch
+    np.testing.assert_allclose(problem.history.load[-1], load, rtol=1e-9)
+
+
+def test_control_of_before_a_rebase():
+    problem, control = bar(Hencky(1e3, 0.3), 5.0, 1.5)
+    problem.solve(steps=2, control=control)
+    problem.rebase()
+    control.value = 1.0
+    with pytest.raises(mpm.MPMError, match="rebased since"):
+        problem.solve(steps=2, control=control)
+    new = mpm.DisplacementControl(problem.particles, 0.5, (0.15, 1.5), (0.0, 1.0))
+    problem.solve(steps=2, control=new)
+    load = 1e3 / (1.0 - 0.3**2) * np.log(2.0) / 2.0
+    np.testing.assert_allclose(problem.history.load[-1], load, rtol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

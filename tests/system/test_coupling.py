@@ -219,6 +219,8 @@ def test_tied_particles_move_to_other_ranks():
     assert np.abs(ends[0] - ends[1]).max() < 1e-10
     if WORLD.size > 1:
         assert problem.history.statistics["repartitions"] > 0
+    with pytest.raises(mpm.MPMError, match="Tie lives on the present body mesh"):
+        problem.rebase()
 
 
 def test_what_is_deleted_is_tied_no_more():
