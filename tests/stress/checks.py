@@ -876,8 +876,11 @@ class Observer:
         about = np.array(data["obstacle"].get("centre", data["obstacle"].get("point")))
         return (x - about - term.offset) @ rotation(term.angle) + about
 
-    def _stretches(self):
-        """Return at most how much larger facets are than at the beginning, for each point."""
+    def _stretches(self, least=False):
+        """Return at most how much larger facets are than at the beginning, for each point.
+
+        By the corners of the domains, as a step begins; or how much larger they are at least.
+        """
         i = 1 if self.pair else 0
         domains, touch = self.domains[i], self.run.touch
         if len(domains.nodes) == 0 or len(touch.points) == 0:
@@ -888,16 +891,18 @@ class Observer:
         element = domains.particles.W.ufl_element().basix_element
         slopes = domains._at(element, basix.geometry(domains.cell), 1.0)[1]
         F = np.eye(dim) + np.einsum("nki,nqkj->nqij", self.previous[i][domains.nodes], slopes)
-        sizes = np.linalg.svd(F, compute_uv=False)
-        sizes = sizes[..., 0] if dim == 2 else sizes[..., 0] * sizes[..., 1]
-        return np.where(off < 1e-6, sizes.max(axis=1)[which], sizes.max())
+        extreme = np.min if least else np.max
+        sizes = np.linalg.svd(F, compute_uv=False)[..., :: -1 if least else 1]
+        sizes = sizes[..., : dim - 1].prod(axis=-1)
+        return np.where(off < 1e-6, extreme(sizes, axis=1)[which], extreme(sizes))
 
     def _check_gaps(self, found, figures):
         """Look at how far apart points in contact may be, by the stiffness that holds them.
 
-        With the penalty -g = p h / (gamma M), M the confined modulus and h the height of the
-        domain over its facet. By Nitsche's method p = <s - gamma M / h g>, where the
-        pressure s of the stress behind the facet is carried on from the points of the domain.
+        With the penalty -g = p h / (gamma M) over the stretch of the facet as the step began, M the
+        confined modulus and h the height of the domain over its facet. By Nitsche's method
+        p = <s - gamma M / h g>, where the pressure s of the stress behind the facet is carried on
+        from the points of the domain.
         """
         data, touch = self.scene["contact"], self.run.touch
         if self.run.time is not None and self.scene["motion_of"]["scheme"] != "euler":
@@ -913,6 +918,7 @@ class Observer:
             if (-gap > 10.0 * soft * highest + 1e-9).any():
                 found.append("bodies are too deep in each other for what presses them")
         elif data.get("law") != "nitsche":
+            soft = soft / self._stretches(least=True)
             if (-gap > soft * pressure * (1.0 + 1e-9) + 1e-9).any():
                 found.append("a point is too deep in an obstacle for what presses it")
         else:

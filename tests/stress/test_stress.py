@@ -80,11 +80,12 @@ def test_checks_find_what_is_wrong(number, tamper, complaint):
     assert any(complaint in sentence for sentence in observer.judge()[0])
 
 
-@pytest.mark.parametrize("support", ["stand", "roll"])
-def test_what_is_below_a_floor_that_holds_it_balances(support):
+@pytest.mark.parametrize(("support", "penalty"), [("stand", 1.0), ("roll", 2.0)])
+def test_what_is_below_a_floor_that_holds_it_balances(support, penalty):
     # A step folds the cell above the floor: a corner begins the next ones 5% of a cell below it, at
     # the nearest place of the boundary. As the cell goes on, forces were 1e-2 out of balance.
     scene = generator.scene(32028, 515253) | {"support": support}
+    scene["contact"] |= {"penalty": penalty}
     run = build.make(scene, WORLD)
     observer, through = checks.Observer(scene, run), False
     background, domains = observer.backgrounds[0], observer.domains[0]
