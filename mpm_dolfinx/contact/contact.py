@@ -206,26 +206,14 @@ class Contact(Results):
         self._share = share
         self._passes.of_step(self._of_step)
         if self._nitsche:
-            self._passes.add_stiffness(lambda body, surface: self._inertial(body, surface, dt))
+            masses = self._masses if dt > 0.0 else ()
+            self._passes.add_stiffness(
+                lambda body, surface: _inertial(surface, masses[body] if masses else None, dt)
+            )
 
     @override
     def weigh(self, masses: Sequence[NDArray[np.float64]]) -> None:
         self._masses = masses
-
-    def _inertial(self, body: int, surface: Surface, dt: float) -> NDArray[np.float64]:
-        """Return the stiffness in a step from the mass behind facets, shape ``(m,)``.
-
-        That is the density times the height over the square of the step, as the modulus is over the
-        height. The stress behind a facet is not on it by as much as that mass is accelerated: held
-        by the modulus alone, a gap would be left there, and closed under another pressure.
-        """
-        if not (self._masses and dt > 0.0):
-            return np.zeros(len(surface.layout.cells))
-        area = surface.weights.sum(axis=1)
-        mass = surface.layout.narrowing * self._masses[body][surface.layout.cells]
-        degree = surface.particles.W.ufl_element().degree
-        behind = np.where(area > 0.0, mass / np.where(area > 0.0, area, 1.0), 0.0)
-        return np.asarray(behind / (degree * dt) ** 2)
 
     @override
     def end_forces(self) -> Sequence[PETSc.Vec]:
@@ -263,6 +251,24 @@ class Contact(Results):
     def take(self, taken: Taken) -> None:
         """Take what was kept (collective)."""
         self._passes.restore([taken.columns[place] for place in self._places], self._materials)
+
+
+def _inertial(
+    surface: Surface, masses: NDArray[np.float64] | None, dt: float
+) -> NDArray[np.float64]:
+    """Return the stiffness in a step from the mass behind facets, shape ``(m,)``.
+
+    That is the density times the height over the square of the step, as the modulus is over the
+    height. The stress behind a facet is not on it by as much as that mass is accelerated: held
+    by the modulus alone, a gap would be left there, and closed under another pressure.
+    """
+    if masses is None:
+        return np.zeros(len(surface.layout.cells))
+    area = surface.weights.sum(axis=1)
+    mass = surface.layout.narrowing * masses[surface.layout.cells]
+    degree = surface.particles.W.ufl_element().degree
+    behind = np.where(area > 0.0, mass / np.where(area > 0.0, area, 1.0), 0.0)
+    return np.asarray(behind / (degree * dt) ** 2)
 
 
 class KeptContact(Kept):
