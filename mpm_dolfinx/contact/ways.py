@@ -81,9 +81,10 @@ def goes_through(
         return True
     way = b - a
     size = np.linalg.norm(way, axis=1)
-    # off the surface, or going through it
-    begins = (gap > on) | (-(normal * way).sum(axis=1) > STEEP * size)
-    ends = (end > on) | ((normal_at_end * way).sum(axis=1) > STEEP * size)
+    # off the surface, or going through it, at an angle or so far that it gets deep all the same
+    far = STEEP * size > deep
+    begins = far | (gap > on) | (-(normal * way).sum(axis=1) > STEEP * size)
+    ends = far | (end > on) | ((normal_at_end * way).sum(axis=1) > STEEP * size)
     which = np.flatnonzero(begins & ends)
     first, enters = _reached(shape, a[which], b[which], on[which])
     goes = first < 1.0

@@ -12,6 +12,7 @@ from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import contact
+from mpm_dolfinx.contact.ways import goes_through
 from mpm_dolfinx.materials import Hencky
 
 
@@ -64,6 +65,30 @@ def test_a_thin_obstacle_does_not_jump_through_a_body(name):
         rigid.move(offset)
         problem.step()
     assert not np.any(rigid.reaction)
+
+
+@pytest.mark.parametrize("name", ["box", "disc"])
+def test_a_way_that_gets_deep_is_one_through_the_obstacle(name):
+    # Depth is concave along a chord of a convex shape, so in its middle it is half of the largest.
+    shape = {"box": contact.box((0.0, 0.0), (10.0, 5.0)), "disc": contact.disc((5.0, 2.5), 2.5)}[
+        name
+    ]
+    rng = np.random.default_rng(7)
+    a = np.column_stack([rng.uniform(0.0, 10.0, 400), np.full(400, 5.0)])  # on top of the box
+    if name == "disc":
+        angle = rng.uniform(0.0, 2.0 * np.pi, 400)
+        a = np.array([5.0, 2.5]) + 2.5 * np.column_stack([np.cos(angle), np.sin(angle)])
+    b = rng.uniform([-3.0, -3.0], [13.0, 8.0], (400, 2))
+    b[:100] = a[:100] + rng.uniform([-20.0, -1.5], [20.0, 0.0], (100, 2))  # many are grazing
+    thickness, share = np.full(1, 0.05), np.linspace(0.0, 1.0, 501)[:, None]
+    gap, normal = shape.distance(a)
+    told = 0
+    for at, end, phi, n in zip(a, b, gap, normal, strict=True):
+        deepest = -shape.distance(at + share * (end - at))[0].min()
+        found = goes_through(shape, at[None], end[None], phi[None], n[None], thickness)
+        assert found or deepest < 2.0 * thickness
+        told += found
+    assert 100 < told < 400
 
 
 def test_a_point_slides_past_the_corner_of_an_obstacle():
