@@ -31,7 +31,7 @@ class NodalMass:
         bodies: The bodies.
         domains: Mass of each owned domain, ``(n, k, k)`` for each body; 0 without inertia.
         matrices: The same on W.
-        deleted: Which of this rank's particles of each body are gone.
+        deleted: Which of this rank's particles of each body were gone.
     """
 
     bodies: Sequence[Particles]
@@ -41,8 +41,8 @@ class NodalMass:
 
     def is_of_present(self) -> bool:
         """Return whether the same particles are gone now (collective)."""
-        now = deleted(self.bodies)
-        same = all(map(np.array_equal, now, self.deleted))
+        pairs = zip(self.bodies, self.deleted, strict=True)
+        same = all(np.array_equal(body.deleted, gone) for body, gone in pairs)
         return over_ranks(self.bodies[0].V.mesh.comm, same, MPI.LAND)
 
     def vectors(self, functions: Sequence[fem.Function]) -> list[PETSc.Vec]:
