@@ -51,8 +51,13 @@ def arc(x: np.ndarray) -> np.ndarray:
     return radius - np.sqrt(radius**2 - x**2) if args.pair else 0.0 * x
 
 
-def half(size: float, sign: float) -> tuple[mpm.Particles, Any, list[fem.DirichletBC]]:
-    """Half of a block or cylinder on its base, below (1) or above (-1); its surface, conditions."""
+def half(
+    size: float, sign: float
+) -> tuple[mpm.Particles, Any, fem.Constant, list[fem.DirichletBC]]:
+    """Half of a block or cylinder, below (1) or above (-1).
+
+    Its surface, the motion of its base, and its conditions.
+    """
     deep, fine = -sign * lines(h), kit.divided(lines(2.0 * size), 2)
     border = np.append(lines(h)[:-1], end + 0.2)  # what is pressed goes sideways
     places = [border, np.sort(np.append(deep, sign * 0.4 * h))]
@@ -65,17 +70,19 @@ def half(size: float, sign: float) -> tuple[mpm.Particles, Any, list[fem.Dirichl
     surface = mpm.facet_tags(body, {1: lambda x: np.isclose(x[1], -sign * arc(x[0]))})
     base = fem.locate_dofs_geometrical(V, lambda x: np.isclose(x[1], -sign * end))
     motion = fem.Constant(background, np.zeros(2))
-    moving.append(motion)
-    bcs = [mpm.held(V, 0, x=0.0), fem.dirichletbc(motion, base, V)]
-    return particles, (surface, 1), bcs
+    return (
+        particles,
+        (surface, 1),
+        motion,
+        [mpm.held(V, 0, x=0.0), fem.dirichletbc(motion, base, V)],
+    )
 
 
 law = mpm.materials.LinearElastic(young, poisson)
-moving: list[fem.Constant] = []
-lower, surface, bcs = half(h / 2.0, 1.0)
+lower, surface, _, bcs = half(h / 2.0, 1.0)
 bodies = [mpm.Body(lower, law)]
 if args.pair:
-    upper, other, more = half(1.3 * h / 2.0, -1.0)
+    upper, other, motion, more = half(1.3 * h / 2.0, -1.0)
     bodies.append(mpm.Body(upper, law))
     bcs += more
     touch = mpm.contact.Pair(lower, upper, facets=(surface, other), **strong)
@@ -88,12 +95,11 @@ problem = mpm.QuasiStaticProblem(bodies, bcs=bcs, terms=[touch])
 def update(t: float) -> None:
     """Press them together."""
     if args.pair:
-        moving[1].value = (0.0, -depth * t)
+        motion.value = (0.0, -depth * t)
     else:
         touch.move((0.0, -depth * t))
 
 
-failure = None
 try:
     for _ in kit.progress(problem.steps(args.steps, update=update), args.steps, args):
         pass
@@ -118,7 +124,7 @@ most = 2.0 * found / np.pi / width
 moment = (area * p * x**2).sum() / (area * p).sum()
 off = force / length - exact
 numbers = {
-    **kit.outcome(problem.history, failure),
+    **kit.outcome(problem.history, None),
     "pressure_error": float(np.sqrt((off**2 * length).sum() / (exact**2 * length).sum())),
     "max_pressure": float(p.max() / most),
     "half_width": float(np.sqrt(4.0 * moment) / width),
