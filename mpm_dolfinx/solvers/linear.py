@@ -95,6 +95,7 @@ class ShiftedFactor:
         self._linear_solver = linear_solver
         self._negative = False
         self._indefinite = 0
+        self._singular = False  # whether multigrid has failed for want of a shift
         self.K: PETSc.Mat | None = None
         self.P: Any = None
         self.D: PETSc.Vec | None = None
@@ -373,10 +374,10 @@ class ShiftedFactor:
         self.K, self.P = K, matrix
 
     def _sweepable(self, K: PETSc.Mat) -> bool:
-        """Return whether sweeps of multigrid may divide by the diagonal of K (collective)."""
+        """Return whether multigrid sweeps over K as it is (collective)."""
         diagonal = K.getDiagonal()
         diagonal.abs()
-        return not self._constrained and bool(diagonal.min()[1] > 0.0)
+        return not (self._constrained or self._singular) and bool(diagonal.min()[1] > 0.0)
 
     def _shifted_copy(self, K: PETSc.Mat, diagonal: PETSc.Vec) -> PETSc.Mat:
         """Return K with more on its diagonal, the same object for the same K."""
@@ -437,17 +438,21 @@ class ShiftedFactor:
         Raises:
             ConvergenceError: The tangent is indefinite, and a smaller step of the load does better.
         """
-        self._ksp.solve(b, x)
         if not self.iterates:
+            self._ksp.solve(b, x)
             return _failure(self._ksp)
-        self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
         K, levels = self.K, self._levels
         assert K is not None and levels is not None
-        reason = self._ksp.getConvergedReason()
-        if reason >= 0 or self._does(b):
+        done = self._iterate(b, x)
+        if not done and self.P is K:
+            self._singular = True
+            self.forget()  # (what has failed is made anew)
+            self._make_levels(K, levels, 0.0)
+            done = self._iterate(b, x)
+        if done:
             self._assess(self._ksp, b)
             return None
-        if reason in INDEFINITE:
+        if self._ksp.getConvergedReason() in INDEFINITE:
             self._negative = True
             if self._solve_indefinite(b, x, self._ksp.getTolerances()[0]):
                 self._assess(self._flexible, b)
@@ -475,6 +480,12 @@ class ShiftedFactor:
         if self.iterates and shorten and self._indefinite < PATIENCE:
             self._indefinite += 1
             raise ConvergenceError("The tangent is not positive definite")
+
+    def _iterate(self, b: PETSc.Vec, x: PETSc.Vec) -> bool:
+        """Solve with multigrid; return whether that does (collective)."""
+        self._ksp.solve(b, x)
+        self._statistics["krylov_iterations"] += self._ksp.getIterationNumber()
+        return self._ksp.getConvergedReason() >= 0 or self._does(b)
 
     def _assess(self, ksp: PETSc.KSP, b: PETSc.Vec) -> None:
         """Note what a solve has left, and whether a factor would have cost less (collective)."""

@@ -44,7 +44,8 @@ class Multigrid:
         self._symmetric = symmetric
         count = len(self._interpolations) + 1
         pc.reset()
-        pc.setType("none")  # what an earlier hierarchy has left goes
+        pc.setType("none")  # what an earlier hierarchy has left goes, and that it has failed
+        pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
         pc.setType("mg")
         pc.setMGLevels(count)
         for number, matrix in enumerate(self._interpolations):

@@ -176,17 +176,29 @@ class Chain(Alone):
         return [P.convert("aij")]
 
 
-def test_multigrid_copies_a_tangent_only_to_shift_it():
-    n, own = 801, MPI.COMM_SELF
-    dense = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
-    K = PETSc.Mat().createDense((n, n), array=dense, comm=own).convert("aij")
-    snes = PETSc.SNES().create(own)
+def multigrid_for(n, levels):
+    """Return multigrid for so many unknowns."""
+    snes = PETSc.SNES().create(MPI.COMM_SELF)
     snes.setOptionsPrefix("chain_")
     given = "chain_", {"ksp_rtol": 1e-12}, True, 1e-13, 2, mpm.Statistics(), "multigrid"
     factor = linear.ShiftedFactor(snes, *given)
-    factor.begin(n, Chain())
+    factor.begin(n, levels)
+    return factor
+
+
+def chain():
+    """Springs in a row between two walls: the tangent, forces, and multigrid for them."""
+    n, own = 801, MPI.COMM_SELF
+    dense = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    K = PETSc.Mat().createDense((n, n), array=dense, comm=own).convert("aij")
+    factor = multigrid_for(n, Chain())
     b = K.createVecLeft()
     b.array_w[:] = np.sin(np.arange(n))
+    return dense, K, b, factor
+
+
+def test_multigrid_copies_a_tangent_only_to_shift_it():
+    dense, K, b, factor = chain()
     b.array_w[400] = 0.0
     x = b.duplicate()
     for case in ("plain", "nothing holds an unknown", "damped", "plain"):
@@ -207,6 +219,43 @@ def test_multigrid_copies_a_tangent_only_to_shift_it():
         error = np.abs(x.array_r - np.linalg.solve(exact, b.array_r)).max()
         assert error < 1e-6 * np.abs(x.array_r).max()
         np.testing.assert_array_equal(K.getDiagonal().array_r, np.diag(values))
+
+
+class Ladder(Chain):
+    """Two unknowns at each place of a chain."""
+
+    def interpolations(self, coarsest, values):
+        (P,) = super().interpolations(coarsest, values)
+        weights = np.kron(P.convert("dense").getDenseArray(), np.eye(2))
+        P = PETSc.Mat().createDense(weights.shape, array=weights, comm=MPI.COMM_SELF)
+        return [P.convert("aij")]
+
+
+def test_multigrid_shifts_a_tangent_that_it_cannot_solve_with_as_it_is():
+    # Sweeps divide by the blocks of rows with the same columns, of which one is singular, though
+    # all diagonals are positive.
+    dense, *_ = chain()
+    dense = np.kron(dense, [[1.0, 0.3], [0.3, 1.0]])
+    pattern = dense != 0.0
+    pair = slice(400, 402)
+    dense[pair] = dense[:, pair] = 0.0
+    dense[pair, pair] = [[1.0, -1.0], [-1.0, 1.0]]
+    n = len(dense)
+    columns = [np.flatnonzero(row).astype(np.int32) for row in pattern]
+    rows = np.concatenate([[0], np.cumsum([len(row) for row in columns])]).astype(np.int32)
+    values = np.concatenate([dense[i, columns[i]] for i in range(n)])
+    csr = rows, np.concatenate(columns), values
+    K = PETSc.Mat().createAIJ((n, n), csr=csr, comm=MPI.COMM_SELF)
+    factor = multigrid_for(n, Ladder())
+    b = K.createVecLeft()
+    b.array_w[:] = np.sin(np.arange(n))
+    b.array_w[pair] = 1.0, -1.0
+    x = b.duplicate()
+    for _ in range(2):
+        factor.set(K, Ladder())
+        assert factor.step(b, x) is None
+        assert factor.iterates and factor.P is not K
+        assert (K * x - b).norm() < 1e-6 * b.norm()
 
 
 @pytest.mark.skip_in_parallel
