@@ -53,6 +53,7 @@ from .arguments import (
     as_terms,
     by_space,
 )
+from .names import OwnNames
 from .parts import Built, Contribution, Parts
 from .reign import Reign
 from .solver import Solver
@@ -72,13 +73,14 @@ type Law = tuple[str, dict[str, Any]]
 """Name of a material, and its parameters: numbers, or indices and values of points."""
 
 
-class Problem(Hooked):
+class Problem(Hooked, OwnNames):
     """Find the displacement of particles at which forces balance, in load steps.
 
     What all problems have is here. Of what their bodies are made is told by
     :class:`ParticleProblem` in UFL, by :class:`QuasiStaticProblem` with materials, and by those
     through time. Each step's increment lives in the background space: ``d = d_n + T u``, residual
-    ``T^T R`` and tangent ``T^T J T``.
+    ``T^T R`` and tangent ``T^T J T``. A subclass that takes a name of an attribute of these for its
+    own is refused.
 
     Args:
         particles: The body or bodies.
@@ -250,7 +252,7 @@ class Problem(Hooked):
         """
         if sys.is_finalizing():
             return
-        if hasattr(self, "trial"):
+        if isinstance(vars(self).get("built"), Built):
             self.release()
         vars(self).clear()
 

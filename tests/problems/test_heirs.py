@@ -192,3 +192,43 @@ def test_a_stage_within_a_reduction_of_strength_is_refused():
     with pytest.raises(mpm.MPMError, match="stage was begun within strength_reduction"):
         mpm.strength_reduction(problem)
     assert problem.points[0].laws.weakening == 1.0
+
+
+@pytest.mark.parametrize("where", ["before", "in its class", "after", "in evaluate", "a method"])
+@pytest.mark.parametrize("name", ["trial", "state", "built", "_output", "bodies"])
+def test_a_name_of_the_problem_is_refused_to_a_subclass(name, where):
+    name = "step" if where == "a method" else name
+
+    class Own(mpm.ParticleProblem):
+        if where == "in its class":
+            locals()[name] = 0.0
+
+        def __init__(self, particles):
+            d, v = particles.displacement, ufl.TestFunction(particles.W)
+            self.stiffness = 1.0
+            if where == "before":
+                setattr(self, name, 0.0)
+            super().__init__(ufl.inner(ufl.grad(d), ufl.grad(v)) * particles.dx, particles)
+            self.present = self.stiffness
+            if where in ("after", "a method"):
+                setattr(self, name, 0.0)
+
+        def evaluate(self):
+            self.stiffness = 2.0
+            if where == "in evaluate":
+                setattr(self, name, 0.0)
+
+    V = scenes.vectors(scenes.box([0, 0], [1, 1], [2, 2], QUADRILATERAL))
+    body = mpm.Particles(scenes.box([0, 0], [1, 1], [2, 2], QUADRILATERAL), V)
+    with pytest.raises(mpm.MPMError, match=f"'{name}' is one of this package's in a Own"):
+        Own(body).step()
+
+
+def test_methods_may_be_replaced_and_other_names_are_free():
+    V = scenes.vectors(scenes.box([0, 0], [1, 1], [2, 2], QUADRILATERAL))
+    body = mpm.Particles(scenes.box([0, 0], [1, 1], [2, 2], QUADRILATERAL), V)
+    problem = mpm.QuasiStaticProblem(mpm.Body(body, VonMises(1e3, 0.3, rho_y=20.0)))
+    called = []
+    problem.commit, problem.mine = lambda: called.append(1), 3
+    problem.step()
+    assert called == [1] and problem.mine == 3

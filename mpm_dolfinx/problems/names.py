@@ -1,0 +1,49 @@
+# Copyright (C) 2026 the mpm-dolfinx authors
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Names of a problem's attributes, which a user's subclass may not take for its own."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from ..errors import MPMError
+from ..parallel.given import PACKAGE
+
+__all__ = ["OwnNames"]
+
+
+def _is_ours(module: str) -> bool:
+    return module.partition(".")[0] == PACKAGE
+
+
+class OwnNames:
+    """A class whose attributes stay its own where users derive from it.
+
+    An attribute that this package sets is refused to all others: before it is set, afterwards, and
+    in the bodies of their classes. So is what cannot be called in the place of a method.
+    """
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute, unless its name is that of another one.
+
+        Raises:
+            MPMError: A subclass takes one of this package, or has taken it before.
+        """
+        ours = vars(self).setdefault("_set_by_us", {"_set_by_us"})
+        classes = [(_is_ours(each.__module__), vars(each)) for each in type(self).__mro__]
+        frame = inspect.currentframe()
+        assert frame is not None and frame.f_back is not None
+        if _is_ours(frame.f_back.f_globals.get("__name__", "")):
+            taken = name in vars(self).keys() - ours
+            taken = taken or any(name in each for our, each in classes if not our)
+            ours.add(name)
+        else:
+            taken = any(our and callable(each.get(name)) for our, each in classes)
+            taken = name in ours or (taken and not callable(value))
+        if taken:
+            raise MPMError(
+                f"The name '{name}' is one of this package's in a {type(self).__name__}; "
+                "give the attribute of your class another one."
+            )
+        super().__setattr__(name, value)
