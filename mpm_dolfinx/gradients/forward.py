@@ -258,7 +258,7 @@ class StepDerivative:
             self._nearby.go(parameter, sign * parameter.change, rates, arrays)
             for body, offset in zip(bodies, offsets, strict=True):
                 body.displacement.x.array[:] += offset
-            self._require(self._reduced.balance.evaluate(), parameter)
+            self._require(self._reduced.balance.evaluate_beside(), parameter)
             return [np.array(self._reduced.terms.shear_moduli(self._fields[n])) for n in new]
 
         pairs = zip(moduli(1.0), moduli(-1.0), strict=True)
@@ -307,7 +307,7 @@ class StepDerivative:
         with ExitStack() as blocks:
             for own in points:
                 blocks.enter_context(own.asked.without_tangents())
-            self._require(self._reduced.balance.evaluate(), parameter)
+            self._require(self._reduced.balance.evaluate_beside(), parameter)
         forces = [force.array_r.copy() for force in self._reduced.unknowns.forces]
         if not whole:
             return _Side(forces, [], [], [])

@@ -86,18 +86,24 @@ class Balance:
             for _, motion in unknowns.places:
                 inverted = motion.particles.inverted()
                 failure = failure or DomainDistortionError.of("turn inside out", inverted)
-            failure = agreed(unknowns.comm, failure) or self._terms.update()
-        if isinstance(failure, TRIAL_ERRORS):
-            return failure
+            failure = agreed(unknowns.comm, failure)
+        return _told(failure) or self.evaluate_beside()
+
+    def evaluate_beside(self) -> MPMError | None:
+        """Do :meth:`evaluate` next to displacements that turn no domain inside out."""
+        unknowns = self._unknowns
+        with self._statistics.phase("constitutive"):
+            failure = _told(self._terms.update())
         if failure is not None:
-            raise failure
+            return failure
         with self._statistics.phase("assemble"):
             forces, outer = unknowns.forces, [0.0] * len(unknowns.fields)
             for force in forces:
                 force.set(0.0)
             for term in self._terms:
-                to = unknowns.zeros() if term.from_outside else forces
-                unknowns.add(term.bodies, term.residuals(), to)
+                parts = term.residuals()
+                to = unknowns.zeros() if parts and term.from_outside else forces
+                unknowns.add(term.bodies, parts, to)
                 for number, (force, part) in enumerate(zip(forces, to, strict=True)):
                     if part is not force:
                         outer[number] += norm(part)
@@ -249,3 +255,10 @@ def _resultant(field: Field) -> NDArray[np.float64]:
     free = field.force.array_r[field.dofs]
     sums = np.bincount(field.dofs % bs, weights=free, minlength=bs)
     return np.asarray(field.factor * field.V.mesh.comm.allreduce(sums))
+
+
+def _told(failure: BaseException | None) -> MPMError | None:
+    """Return a failure that another x may mend, or raise it."""
+    if failure is None or isinstance(failure, TRIAL_ERRORS):
+        return failure
+    raise failure
