@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, override
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 from pyadjoint import AdjFloat, Block, OverloadedType, create_overloaded_object
@@ -15,12 +17,42 @@ from pyadjoint import AdjFloat, Block, OverloadedType, create_overloaded_object
 from dolfinx import fem
 
 from ..errors import MPMError, warn
+from ..parallel.totals import over_ranks
 from ..problems.quasistatic import QuasiStaticProblem
+from ..stepping.trial import Trial
 from .adjoint import Adjoint
+from .sensitivity import Sensitivity
 
 __all__ = ["RunBlock"]
 
 type Array = NDArray[np.float64]
+
+
+class _Tangent(Sensitivity):
+    """Derivatives of displacements after each step, in one direction of all parameters.
+
+    Args:
+        problem: As for :class:`Sensitivity`.
+        ways: Parameters with their directions.
+    """
+
+    def __init__(self, problem: QuasiStaticProblem, ways: Sequence[Any]) -> None:
+        super().__init__(problem, ways)
+        self.displacements: list[list[Array]] = []
+
+    @override
+    def solved(self, trial: Trial) -> Callable[[], None]:
+        take = super().solved(trial)
+
+        def take_and_keep() -> None:
+            take()
+            rates = [one if isinstance(one, list) else [one] for one in self.displacement]
+            of_bodies = [
+                [function.x.array for function in body] for body in zip(*rates, strict=True)
+            ]
+            self.displacements.append([np.sum(each, axis=0) for each in of_bodies])
+
+        return take_and_keep
 
 
 class RunBlock(Block):  # type: ignore[misc]
@@ -134,6 +166,43 @@ class RunBlock(Block):  # type: ignore[misc]
         displacement = create_overloaded_object(fem.Function(block_variable.output.function_space))
         displacement.x.array[:] = prepared[idx]
         return displacement
+
+    @override
+    def prepare_evaluate_tlm(
+        self, inputs: Any, tlm_inputs: Any, relevant_outputs: Any
+    ) -> list[Array] | None:
+        assert self._adjoint is not None
+        comm = self._adjoint.problem.bodies[0].mesh.comm
+        ways = []
+        for parameter, given in zip(self._parameters, tlm_inputs, strict=True):
+            if isinstance(parameter, fem.Function):
+                way = np.zeros(1) if given is None else np.array(getattr(given, "x", given).array)
+            else:
+                way = np.array(0.0 if given is None else float(given))
+            if over_ranks(comm, bool(np.any(way)), MPI.LOR):
+                ways.append((parameter, way))
+        if not ways:
+            return None
+        with self._with(inputs):
+            problem = self._made()
+            tangent = _Tangent(problem, ways)
+            self._run(problem)
+            return self._chosen(tangent.displacements)
+
+    @override
+    def evaluate_tlm_component(
+        self,
+        inputs: Any,
+        tlm_inputs: Any,
+        block_variable: Any,
+        idx: int,
+        prepared: list[Array] | None = None,
+    ) -> Any:
+        return (
+            None
+            if prepared is None
+            else self.recompute_component(inputs, block_variable, idx, prepared)
+        )
 
     @override
     def prepare_evaluate_adj(

@@ -26,8 +26,9 @@ def taped(
 
     What follows on the tape, such as ``dolfinx_adjoint.assemble_scalar`` of a misfit, and what
     pyadjoint makes of it (``ReducedFunctional``, ``taylor_test``, ``minimize``) is as in any script
-    with dolfinx-adjoint. Derivatives are those of an :class:`Adjoint`; there is no tangent-linear
-    block. Where the tape is played again, the problem is made and run again::
+    with dolfinx-adjoint. Derivatives are those of an :class:`Adjoint`; a tangent-linear model
+    (``reduced.tlm``) takes a run of its own, with a :class:`Sensitivity`. Where the tape is played
+    again, the problem is made and run again::
 
         young = dolfinx_adjoint.Function(fem.functionspace(body, ("DG", 0)))
         young.x.array[:] = 5e4

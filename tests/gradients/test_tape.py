@@ -101,6 +101,24 @@ def test_it_is_what_an_adjoint_says_and_runs_once():
     assert np.abs(found - slope)[mine].max(initial=0.0) < 1e-9 * size
 
 
+def test_the_tangent_linear_model_is_what_the_adjoint_says():
+    block = Block()
+    last, second = mpm.taped(block.made, block.controls, five, steps=[-1, 1])
+    J = dolfinx_adjoint.assemble_scalar((ufl.inner(last, last) + second[1] ** 2) * ufl.dx)
+    reduced = pyadjoint.ReducedFunctional(
+        J, [pyadjoint.Control(block.young), pyadjoint.Control(block.weight)]
+    )
+    way = block.change(20.0)
+    forward = float(reduced.tlm([way, pyadjoint.AdjFloat(0.3)]))
+    slope, by_weight = reduced.derivative()
+    own = slice(0, way.function_space.dofmap.index_map.size_local)
+    backward = WORLD.allreduce(float(slope.x.array[own] @ way.x.array[own])) + 0.3 * by_weight
+    assert abs(forward - backward) < 1e-8 * abs(backward)
+    assert float(reduced.tlm([block.change(0.0), pyadjoint.AdjFloat(0.3)])) == pytest.approx(
+        0.3 * float(by_weight), rel=1e-8
+    )
+
+
 @pytest.mark.skip_in_parallel
 def test_a_stiffness_is_found_by_minimize():
     """In units in which its values are near 1, as a minimiser's first step is of that size."""
