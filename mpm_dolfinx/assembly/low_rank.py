@@ -11,6 +11,7 @@ import numpy as np
 from .. import _compat
 from ..constitutive.averaging import Array, Linearised
 from ..particles.particles import Particles
+from .petsc import with_entries_at
 
 __all__ = ["LowRankTangent", "ReducedLowRank"]
 
@@ -72,17 +73,13 @@ class LowRankTangent:
     def _empty(self) -> PETSc.Mat:
         """Return a matrix with a row for each group and the dofs of W as columns."""
         layout, gdim = self._W.dofmap.index_map, self._W.dofmap.index_map_bs
-        blocks = layout.local_to_global(self._nodes.ravel()).astype(PETSc.IntType)
-        dofs = (blocks[:, None] * gdim + np.arange(gdim, dtype=PETSc.IntType)).ravel()
+        blocks = layout.local_to_global(self._nodes.ravel())
+        dofs = blocks[:, None] * gdim + np.arange(gdim, dtype=PETSc.IntType)
         groups = self._source.groups
-        rows = np.repeat(groups.number, self._nodes.shape[1] * gdim).astype(PETSc.IntType)
-        matrix = PETSc.Mat().create(comm=self._W.mesh.comm)
+        rows = np.repeat(groups.number, self._nodes.shape[1] * gdim)
         columns = (layout.size_local * gdim, layout.size_global * gdim)
-        matrix.setSizes(((groups.owned, groups.count), columns))
-        matrix.setType("aij")
-        # PETSc sorts the index arrays in place.
-        _compat.set_entry_places(matrix, rows, dofs)
-        return matrix
+        sizes = ((groups.owned, groups.count), columns)
+        return with_entries_at(self._W.mesh.comm, sizes, rows, dofs)
 
 
 def _number(parts: list[Array], part: Array) -> int:

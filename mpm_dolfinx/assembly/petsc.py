@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -27,6 +28,7 @@ __all__ = [
     "create_vector",
     "load_quotient",
     "marked",
+    "with_entries_at",
 ]
 
 # Their types name the first of several dispatched signatures only.
@@ -76,11 +78,32 @@ def assembled(
     """Return the sum of entries of any rank on nodes (bs 1) or dofs of V (collective)."""
     imap = V.dofmap.index_map
     sizes = (imap.size_local * bs, imap.size_global * bs)
-    matrix = PETSc.Mat().create(comm=V.mesh.comm)
-    matrix.setSizes((sizes, sizes))
-    matrix.setType("aij")
-    _compat.set_entry_places(matrix, rows.astype(PETSc.IntType), columns.astype(PETSc.IntType))
+    matrix = with_entries_at(V.mesh.comm, (sizes, sizes), rows, columns)
     _compat.set_entries(matrix, np.ascontiguousarray(values))
+    return matrix
+
+
+def with_entries_at(
+    comm: MPI.Comm,
+    sizes: Sequence[tuple[int, int]],
+    rows: NDArray[Any],
+    columns: NDArray[Any],
+) -> PETSc.Mat:
+    """Return a matrix whose entries :func:`._compat.set_entries` sums up at places (collective).
+
+    Args:
+        comm: The ranks.
+        sizes: Numbers of rows of this rank and of all, and of columns.
+        rows: Global row of each entry, any rank's, of any shape.
+        columns: Global column of each entry, likewise.
+    """
+    matrix = PETSc.Mat().create(comm=comm)
+    matrix.setSizes(sizes)
+    matrix.setType("aij")
+    # (copies: PETSc sorts them in place)
+    _compat.set_entry_places(
+        matrix, *(part.astype(PETSc.IntType).ravel() for part in (rows, columns))
+    )
     return matrix
 
 

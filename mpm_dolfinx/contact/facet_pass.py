@@ -23,6 +23,7 @@ from .memory import FacetMemory, no_memory, spread
 from .neighbourhood import Neighbourhood, Sides
 from .one_pass import Pass, retold, worn
 from .outcome import Outcome, untouched
+from .pair_matrices import Places
 from .stencil import Start, Stencil, acting
 from .surface import Surface
 
@@ -293,22 +294,12 @@ class FacetPass(Pass[State, Meeting]):
         if self.evaluation is None:
             self.evaluate()
         assert self.evaluation is not None
-        found = self.evaluation.forces()
-        for force in found:
-            force.scale(factor)
-        return found
+        return self.evaluation.forces(factor)
 
     @override
-    def add_tangents(
-        self,
-        factor: float,
-        secants: bool,
-        group: NDArray[np.int64],
-        positions: NDArray[np.int32],
-        values: Array,
-    ) -> None:
+    def add_tangents(self, factor: float, secants: bool, into: Places) -> None:
         assert self.evaluation is not None
-        self.evaluation.add_tangents(factor, group, positions, values)
+        self.evaluation.add_tangents(factor, into)
 
     @override
     def after(self) -> State:

@@ -21,8 +21,8 @@ from .law import Friction
 from .memory import FacetMemory, no_memory, spread
 from .nitsche import Spread
 from .outcome import Outcome, untouched
-from .pair_matrices import Met
-from .stencil import Acting, Stencil, Sums, add_tangents, by_stress, remembered
+from .pair_matrices import Met, Places
+from .stencil import Acting, Stencil, add_tangents, by_stress, remembered
 from .surface import global_nodes
 
 __all__ = ["Meeting"]
@@ -82,14 +82,14 @@ class Meeting:
         push, rub = ((p * change).sum(axis=(1, 2)) for p in (self.acting.pushes, self.acting.rubs))
         return -float(w @ push), -float(w @ rub)
 
-    def forces(self) -> list[PETSc.Vec]:
-        """Return the forces on the nodes of both bodies (collective)."""
+    def forces(self, factor: float) -> list[PETSc.Vec]:
+        """Return the forces on the nodes of both bodies, times a factor (collective)."""
         around = self.approach.around
         sides = around.sides
-        first = sides.source.force(self.outcome.traction, sides.share, around.facets)
+        first = sides.source.force(self.outcome.traction, factor * sides.share, around.facets)
         second = create_vector(sides.target.particles.W)
         reaction = (self.acting.pushes + self.acting.rubs)[:, 1:]
-        values = around.weights[self.stencil.which][:, None, None] * reaction
+        values = factor * around.weights[self.stencil.which][:, None, None] * reaction
         dofs = around.near.dofs[self.facet].astype(PETSc.IntType)
         second.setValues(dofs.ravel(), values.ravel(), addv=PETSc.InsertMode.ADD_VALUES)
         second.assemble()
@@ -106,27 +106,12 @@ class Meeting:
         mine = global_nodes(source.particles.W, source.layout.nodes[own])
         return Met(np.stack([own, *others], axis=1), (mine, *nodes))
 
-    def add_tangents(
-        self,
-        factor: float,
-        group: NDArray[np.int64],
-        positions: NDArray[np.int32],
-        values: NDArray[np.float64],
-    ) -> None:
-        """Add the forces' derivatives to blocks.
-
-        Args:
-            factor: What they are multiplied by.
-            group: See :class:`Sums`.
-            positions: As there.
-            values: As there.
-        """
+    def add_tangents(self, factor: float, into: Places) -> None:
+        """Add the forces' derivatives, times a factor, to blocks."""
         which, around = self.stencil.which, self.approach.around
         shapes = around.sides.source.shapes
-        sums = Sums(
-            factor * around.weights[which], shapes[which % len(shapes)], group, positions, values
-        )
-        add_tangents(self.law, self.stencil, around.sides.touch, sums)
+        weights, spread = factor * around.weights[which], shapes[which % len(shapes)]
+        add_tangents(self.law, self.stencil, around.sides.touch, weights, spread, into)
 
     def by_stress(self, factor: float) -> tuple[At, list[Spread]]:
         """Return points with normals, and how forces on both bodies grow with the stress behind.

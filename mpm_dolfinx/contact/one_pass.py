@@ -15,7 +15,7 @@ from .behind import At
 from .law import Friction
 from .nitsche import Nitsche, Spread
 from .outcome import Outcome
-from .pair_matrices import Met
+from .pair_matrices import Met, Places
 from .surface import Surface
 
 __all__ = ["Evaluation", "Pass"]
@@ -164,22 +164,13 @@ class Pass[State, Found: Evaluation]:
         """
         raise NotImplementedError
 
-    def add_tangents(
-        self,
-        factor: float,
-        secants: bool,
-        group: NDArray[np.int64],
-        positions: NDArray[np.int32],
-        values: Array,
-    ) -> None:
-        """Add the derivatives of the forces to blocks; see :class:`Sums`.
+    def add_tangents(self, factor: float, secants: bool, into: Places) -> None:
+        """Add the derivatives of the forces to blocks.
 
         Args:
             factor: What they are multiplied by.
             secants: Whether points that have changed their slip may take secants instead.
-            group: Group of each point where something acts.
-            positions: Blocks of each group.
-            values: The blocks.
+            into: The blocks, for each point where something acts.
         """
         raise NotImplementedError
 

@@ -22,9 +22,10 @@ from dolfinx import fem
 
 from .. import _compat
 from .._core import loops
+from ..assembly.petsc import with_entries_at
 from .surface import sizes_of
 
-__all__ = ["Met", "PairMatrices"]
+__all__ = ["Met", "PairMatrices", "Places"]
 
 
 class Met(NamedTuple):
@@ -46,14 +47,27 @@ class Met(NamedTuple):
         return len(self.facets), sum(widths[:2]), sum(widths)
 
 
+class Places(NamedTuple):
+    """Where derivatives at the points of a pass add up: in blocks between nodes.
+
+    Attributes:
+        group: Group of each point, shape ``(n,)``.
+        positions: Blocks of each group, by forces on nodes of a point's facet and of the one that
+            it meets, and places of these nodes and of those of the anchor's, ``(g, r, c)``.
+        values: The blocks, shape ``(b, gdim, gdim)``.
+    """
+
+    group: NDArray[np.int64]
+    positions: NDArray[np.int32]
+    values: NDArray[np.float64]
+
+
 class PairMatrices:
     """Matrices on W of one body or two, whose patterns grow as facets come to be touched.
 
     Args:
         spaces: W of the bodies.
 
-    Attributes:
-        values: Their blocks, shape ``(b, gdim, gdim)``, to be added to: see :meth:`groups`.
     """
 
     def __init__(self, spaces: Sequence[fem.FunctionSpace]) -> None:
@@ -65,17 +79,13 @@ class PairMatrices:
         sides = range(len(spaces))
         self._counts = dict.fromkeys([(i, j) for i in sides for j in sides], 0)
         self._positions: list[NDArray[np.int32]] = []
-        self.values = np.zeros((0, self._gdim, self._gdim))
+        self._values = np.zeros((0, self._gdim, self._gdim))
 
-    def groups(self, met: Sequence[Met]) -> list[tuple[NDArray[np.int64], NDArray[np.int32]]]:
-        """Return where points are to be added, and set :attr:`values` to zero (collective).
+    def begin(self, met: Sequence[Met]) -> list[Places]:
+        """Set all blocks to zero; return where points of each pass add to them (collective).
 
         Args:
             met: What points of the first body meet, and, in a second pass, those of the other.
-
-        Returns:
-            For each pass the group of each point, and the blocks of each group between nodes of the
-            point's facet and that which it meets, and these and those of the anchor's.
         """
         if not self._known:
             self._known = [Met(one.facets[:0], tuple(x[:0] for x in one.nodes)) for one in met]
@@ -97,8 +107,9 @@ class PairMatrices:
             found.append(group.ravel()[count:])
         if self._comm.allreduce(grown or not self._positions, MPI.LOR):
             self._make()
-        self.values[:] = 0.0
-        return list(zip(found, self._positions, strict=True))
+        self._values[:] = 0.0
+        pairs = zip(found, self._positions, strict=True)
+        return [Places(group, positions, self._values) for group, positions in pairs]
 
     def _make(self) -> None:
         """Find the blocks between all nodes of facets that have met (collective)."""
@@ -119,7 +130,7 @@ class PairMatrices:
                 whole[:, row, column] = begin + place
             new[i, j] = np.repeat(names[i], np.diff(ends)), names[j][nodes]
             begin += len(nodes)
-        self.values = np.zeros((begin, self._gdim, self._gdim))
+        self._values = np.zeros((begin, self._gdim, self._gdim))
         grown = {pair for pair, count in self._counts.items() if len(new[pair][0]) > count}
         anywhere = set().union(*self._comm.allgather(grown))
         for pair in self._counts:
@@ -131,16 +142,12 @@ class PairMatrices:
         self, pair: tuple[int, int], rows: NDArray[np.int64], columns: NDArray[np.int64]
     ) -> PETSc.Mat:
         """Return a matrix with blocks between global nodes (collective)."""
-        matrix = PETSc.Mat().create(self._comm)
-        matrix.setSizes([self._sizes[side] for side in pair])
-        matrix.setType("aij")
         part = np.arange(self._gdim)
-        shape = (len(rows), self._gdim, self._gdim)
-        i = np.broadcast_to((rows[:, None] * self._gdim + part)[:, :, None], shape)
-        j = np.broadcast_to((columns[:, None] * self._gdim + part)[:, None, :], shape)
-        places = (x.astype(PETSc.IntType).ravel() for x in (i, j))
-        _compat.set_entry_places(matrix, *places)
-        return matrix
+        i, j = (nodes[:, None] * self._gdim + part for nodes in (rows, columns))
+        sizes = [self._sizes[side] for side in pair]
+        return with_entries_at(
+            self._comm, sizes, *np.broadcast_arrays(i[:, :, None], j[:, None, :])
+        )
 
     def assembled(self) -> dict[tuple[int, int], PETSc.Mat]:
         """Return the matrices, the same objects as before where no blocks have come (collective).
@@ -150,7 +157,7 @@ class PairMatrices:
         begin, found = 0, dict[tuple[int, int], PETSc.Mat]()
         for pair, count in self._counts.items():
             if pair in self._matrices:
-                values = self.values[begin : begin + count]
+                values = self._values[begin : begin + count]
                 _compat.set_entries(self._matrices[pair], values.ravel())
                 found[pair] = self._matrices[pair]
             begin += count

@@ -188,10 +188,10 @@ class Passes:
         if any(each.evaluation is None for each in self.every):
             self.evaluate()
         found_by = [each.evaluation for each in self.every if each.evaluation is not None]
-        groups = self._matrices.groups([evaluation.met() for evaluation in found_by])
+        places = self._matrices.begin([evaluation.met() for evaluation in found_by])
         with agree(self._comm):  # of the slopes of a user's shape
-            for each, (group, positions) in zip(self.every, groups, strict=True):
-                each.add_tangents(factor, secants, group, positions, self._matrices.values)
+            for each, into in zip(self.every, places, strict=True):
+                each.add_tangents(factor, secants, into)
         found = {place: [K] for place, K in self._matrices.assembled().items()}
         for own, (each, evaluation) in enumerate(zip(self.every, found_by, strict=True)):
             if each.stress is not None:

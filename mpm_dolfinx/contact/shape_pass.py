@@ -39,7 +39,7 @@ from .memory import ShapeMemory
 from .nitsche import Spread
 from .one_pass import Pass, retold, worn
 from .outcome import Outcome, untouched
-from .pair_matrices import Met
+from .pair_matrices import Met, Places
 from .placed import distance_within, framed, unframed
 from .reach import Reach, is_near
 from .rotation import QUARTER, Pose
@@ -423,14 +423,7 @@ class ShapePass(Pass[ShapeMemory, Touch]):
         return secants
 
     @override
-    def add_tangents(
-        self,
-        factor: float,
-        secants: bool,
-        group: NDArray[np.int64],
-        positions: NDArray[np.int32],
-        values: Array,
-    ) -> None:
+    def add_tangents(self, factor: float, secants: bool, into: Places) -> None:
         assert self.evaluation is not None
         found, source = self.evaluation, self.source
         self.tangent = found.slopes()
@@ -439,7 +432,7 @@ class ShapePass(Pass[ShapeMemory, Touch]):
         facets, places = found.of_acting
         weights = factor * source.weights[facets, places]
         D = np.ascontiguousarray(self.tangent)
-        loops.add_slopes(D, weights, source.shapes[places], group, positions, values)
+        loops.add_slopes(D, weights, source.shapes[places], *into)
 
     @override
     def after(self) -> ShapeMemory:

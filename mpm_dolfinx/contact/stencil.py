@@ -19,12 +19,12 @@ from .._core import loops
 from .facets import Table
 from .law import Begun, Friction, Points, Separation, Traction, bounds, known
 from .law import remembered as remembered_by
+from .pair_matrices import Places
 
 __all__ = [
     "Acting",
     "Start",
     "Stencil",
-    "Sums",
     "acting",
     "add_tangents",
     "by_stress",
@@ -75,26 +75,6 @@ class Stencil(NamedTuple):
     outward: NDArray[np.float64]
     start: Start | None
     behind: NDArray[np.float64] | None = None
-
-
-class Sums(NamedTuple):
-    """Where derivatives at points add up: in blocks between nodes.
-
-    Attributes:
-        weights: Of the points, shape ``(n,)``.
-        shapes: Shape functions by which a point is spread over the a nodes of its own facet,
-            ``(n, a)``.
-        group: Group of each point, shape ``(n,)``.
-        positions: Blocks of each group, by forces on nodes of a point's facet and of the one that
-            it meets, and places of these nodes and of those of the anchor's, ``(g, r, c)``.
-        values: The blocks, shape ``(b, gdim, gdim)``.
-    """
-
-    weights: NDArray[np.float64]
-    shapes: NDArray[np.float64]
-    group: NDArray[np.int64]
-    positions: NDArray[np.int32]
-    values: NDArray[np.float64]
 
 
 class Acting(NamedTuple):
@@ -185,16 +165,21 @@ def acting(law: Friction, stencil: Stencil, touch: float) -> Acting:
     return Acting(pushes, rubs, Traction(pressure, pushes[:, 0], rubs[:, 0], *masks))
 
 
-def add_tangents(law: Friction, stencil: Stencil, touch: float, sums: Sums) -> None:
+def add_tangents(
+    law: Friction, stencil: Stencil, touch: float, weights: Array, shapes: Array, into: Places
+) -> None:
     """Add the derivatives of all forces at the points' stencils to blocks.
 
     Args:
         law: As for :func:`acting`, as all that is not said here.
         stencil: As there.
         touch: As there.
-        sums: Where they add up.
+        weights: Of the points, shape ``(n,)``.
+        shapes: Shape functions by which a point is spread over the a nodes of its own facet,
+            ``(n, a)``.
+        into: The blocks.
     """
     if len(stencil.x) == 0:
         return
-    where = [np.ascontiguousarray(part) for part in sums[:4]]
-    loops.add_tangents(*_arguments(law, stencil, touch), *where, sums.values)
+    where = [np.ascontiguousarray(part) for part in (weights, shapes, *into[:2])]
+    loops.add_tangents(*_arguments(law, stencil, touch), *where, into.values)

@@ -19,7 +19,7 @@ from dolfinx import fem, la, mesh
 
 from .. import _compat
 from ..assembly.inputs import is_tag, known_tags
-from ..assembly.petsc import create_vector
+from ..assembly.petsc import create_vector, with_entries_at
 from ..errors import MPMError
 from ..meshes.remesh import Column
 from ..parallel.given import require_truth
@@ -493,8 +493,8 @@ class PointMatrix:
         self._sizes = tuple(s if isinstance(s, tuple) else sizes_of(s) for s in (rows, columns))
         self._matrix: PETSc.Mat | None = None
         self._keys = np.zeros(0, dtype=np.int64)
-        self._i: list[NDArray[np.int64]] = []
-        self._j: list[NDArray[np.int64]] = []
+        self._i = [self._keys]
+        self._j = [self._keys]
 
     def of(self, part: Blocks) -> PETSc.Mat | None:
         """Return the matrix of some blocks, the same object where no new ones come (collective).
@@ -511,7 +511,8 @@ class PointMatrix:
             self._i.append(np.repeat(rows, columns.shape[1], axis=1).ravel())
             self._j.append(np.tile(columns, (1, rows.shape[1])).ravel())
             self._keys = np.concatenate([self._keys, part.keys[new]])
-            self._matrix = self._make()
+            i, j = map(np.concatenate, (self._i, self._j))
+            self._matrix = with_entries_at(self._comm, self._sizes, i, j)
         if self._matrix is None:
             return None
         order = np.argsort(self._keys)
@@ -521,16 +522,6 @@ class PointMatrix:
         values[places] = part.values.reshape(len(places), size)
         _compat.set_entries(self._matrix, values.ravel())
         return self._matrix
-
-    def _make(self) -> PETSc.Mat:
-        matrix = PETSc.Mat().create(self._comm)
-        matrix.setSizes(self._sizes)
-        matrix.setType("aij")
-        none = np.zeros(0, dtype=PETSc.IntType)
-        i = np.concatenate([none, *self._i]).astype(PETSc.IntType)
-        j = np.concatenate([none, *self._j]).astype(PETSc.IntType)
-        _compat.set_entry_places(matrix, i, j)
-        return matrix
 
 
 def sizes_of(W: fem.FunctionSpace) -> tuple[int, int]:

@@ -49,8 +49,8 @@ def test_blocks_are_where_their_nodes_say_also_where_others_come_up_later():
             for i in (0, 1)
             for j in (0, 1)
         }
-        for number, (one, (group, positions)) in enumerate(
-            zip(passes, matrices.groups(passes), strict=True)
+        for number, (one, (group, positions, values)) in enumerate(
+            zip(passes, matrices.begin(passes), strict=True)
         ):
             sides = [(number, one.nodes[0]), *((1 - number, nodes) for nodes in one.nodes[1:])]
             places = [(side, nodes[:, k]) for side, nodes in sides for k in range(2)]
@@ -58,7 +58,7 @@ def test_blocks_are_where_their_nodes_say_also_where_others_come_up_later():
                 for a, (i, rows) in enumerate(places[:4]):
                     for b, (j, columns) in enumerate(places):
                         block = rng.normal(size=(2, 2))
-                        matrices.values[positions[group[p], a, b]] += block
+                        values[positions[group[p], a, b]] += block
                         row, column = 2 * rows[p], 2 * columns[p]
                         known[i, j][row : row + 2, column : column + 2] += block
         found = matrices.assembled()
