@@ -12,7 +12,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import ConvergenceError, MPMError
+from ..errors import MPMError
 from ..io.identity import same
 from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
@@ -144,12 +144,7 @@ class Contact(Results):
 
     @override
     def update(self) -> MPMError | None:
-        try:
-            self._passes.evaluate()
-        except np.linalg.LinAlgError:
-            return ConvergenceError("Facets of a Pair collapse; take smaller steps")
-        except MPMError as error:
-            return error
+        self._passes.evaluate()
         return None
 
     @override
@@ -206,10 +201,12 @@ class Contact(Results):
         self._share = share
         self._passes.of_step(self._of_step)
         if self._nitsche:
-            masses = self._masses if dt > 0.0 else ()
-            self._passes.add_stiffness(
-                lambda body, surface: _inertial(surface, masses[body] if masses else None, dt)
-            )
+            surfaces = self._passes.surfaces
+            more = [np.zeros(len(surface.thickness)) for surface in surfaces]
+            if dt > 0.0 and self._masses:
+                pairs = zip(surfaces, self._masses, strict=True)
+                more = [_inertial(surface, masses, dt) for surface, masses in pairs]
+            self._passes.add_stiffness(more)
 
     @override
     def weigh(self, masses: Sequence[NDArray[np.float64]]) -> None:
@@ -253,17 +250,13 @@ class Contact(Results):
         self._passes.restore([taken.columns[place] for place in self._places], self._materials)
 
 
-def _inertial(
-    surface: Surface, masses: NDArray[np.float64] | None, dt: float
-) -> NDArray[np.float64]:
+def _inertial(surface: Surface, masses: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
     """Return the stiffness in a step from the mass behind facets, shape ``(m,)``.
 
     That is the density times the height over the square of the step, as the modulus is over the
     height. The stress behind a facet is not on it by as much as that mass is accelerated: held
     by the modulus alone, a gap would be left there, and closed under another pressure.
     """
-    if masses is None:
-        return np.zeros(len(surface.layout.cells))
     area = surface.weights.sum(axis=1)
     mass = surface.layout.narrowing * masses[surface.layout.cells]
     degree = surface.particles.W.ufl_element().degree

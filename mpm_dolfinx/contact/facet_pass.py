@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, override
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -80,12 +79,9 @@ class FacetPass(Pass[State, Meeting]):
     ) -> None:
         super().__init__(source, law, penalty)
         self.share = share
-        self._comm: MPI.Comm = source.particles.mesh.comm
+        self._target = target
         self._stiffness = self._normal = self._in_series(*stiffnesses)
-        reach = REACH * max(
-            float(np.median(np.concatenate(self._comm.allgather(surface.sizes))))
-            for surface in (source, target)
-        )
+        reach = REACH * max(surface.size for surface in (source, target))
         body = target.particles
         facets = len(basix.topology(body.mesh.basix_cell())[target.gdim - 1])
         number = body.global_index[target.layout.cells] * facets + target.layout.facets
@@ -101,8 +97,7 @@ class FacetPass(Pass[State, Meeting]):
 
     def _in_series(self, source: Array, target: Array) -> Array:
         """Return both bodies' stiffnesses one behind the other (collective)."""
-        facing = float(np.median(np.concatenate(self._comm.allgather(target))))
-        return 1.0 / (1.0 / source + 1.0 / facing)
+        return 1.0 / (1.0 / source + 1.0 / self._target.median(target))
 
     # -- What it tells ----------------------------------------------------------------------------
 

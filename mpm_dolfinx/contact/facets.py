@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 import basix
 
 from .._core import loops
+from ..errors import ConvergenceError
 from ..parallel.exchange import swap
 from ..tolerances import HALF_DIGITS, LOCAL_ITERATIONS
 from .surface import Surface, global_dofs, normals
@@ -27,6 +28,8 @@ __all__ = ["Closest", "NearFacets", "Table", "separated"]
 #: Cosine of the angle of two normals below which surfaces face each other; and in the middle of a
 #: facet, below which they may do so somewhere, and below which they do so for sure.
 FACING, MAY_FACE, SURELY_FACING = -0.1, 0.5, -0.4
+
+COLLAPSE = "Facets of a Pair collapse; take smaller steps"
 
 #: Shape functions of a facet at points, ``(n, k)``, with their first and second derivatives.
 type Table = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
@@ -158,12 +161,12 @@ class NearFacets:
             place: Where to begin, shape ``(n, e)``.
 
         Raises:
-            numpy.linalg.LinAlgError: A facet has no area.
+            ConvergenceError: A facet has no area.
         """
         found = np.array(place)
         nodes = np.ascontiguousarray(nodes)
         if not loops.project(np.ascontiguousarray(points), nodes, *self._shape, found):
-            raise np.linalg.LinAlgError("A facet has no area.")
+            raise ConvergenceError(COLLAPSE)
         return found
 
     def clamped(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -190,7 +193,7 @@ class NearFacets:
             reach: How near a facet must be.
 
         Raises:
-            numpy.linalg.LinAlgError: A facet has no area.
+            ConvergenceError: A facet has no area.
         """
         found = Closest.none(len(points), self.gdim - 1)
         good = loops.find_closest(
@@ -208,7 +211,7 @@ class NearFacets:
             found.beside,
         )
         if not good:
-            raise np.linalg.LinAlgError("A facet has no area.")
+            raise ConvergenceError(COLLAPSE)
         return found
 
 

@@ -13,8 +13,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, override
 
-from mpi4py import MPI
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,10 +142,7 @@ def _shares(surfaces: Sequence[Surface], count: int) -> list[float]:
     """
     if count == 1:
         return [1.0]
-    comm: MPI.Comm = surfaces[0].particles.mesh.comm
-    squares = [
-        float(np.median(np.concatenate(comm.allgather(surface.sizes)))) ** 2 for surface in surfaces
-    ]
+    squares = [surface.size**2 for surface in surfaces]
     if max(squares) < ALIKE**2 * min(squares):
         return [0.5, 0.5]
     first = float(np.clip(squares[1] / sum(squares), LEAST, 1.0 - LEAST))

@@ -103,18 +103,12 @@ class Passes:
         for each in self.every:
             each.of_step = whole
 
-    def add_stiffness(self, more: Callable[[int, Surface], Array]) -> None:
-        """Take stiffnesses that come on top of those of the bodies in a step of a motion.
-
-        Args:
-            more: Returns them by the number of a body and its facets, shape ``(m,)``.
-        """
-        k = [
-            own + more(i, surface)
-            for i, (own, surface) in enumerate(zip(self._stiffnesses, self.surfaces, strict=True))
-        ]
-        for i, each in enumerate(self.every):
-            each.stiffen(*(k if i == 0 else k[::-1]))
+    def add_stiffness(self, more: Sequence[Array]) -> None:
+        """Take stiffnesses on top of those of the facets, ``(m,)``, in a step of a motion."""
+        k = [own + on_top for own, on_top in zip(self._stiffnesses, more, strict=True)]
+        for each in self.every:
+            each.stiffen(*k)
+            k = k[::-1]
 
     def _new_pattern(self) -> None:
         self._matrices = PairMatrices([surface.particles.W for surface in self.surfaces])

@@ -127,8 +127,6 @@ class Layout:
         extent: Largest coordinate of the undeformed body.
         distinct: The nodes of all facets, each once, shape ``(n,)``.
         positions: Where they are in the mesh, shape ``(n, gdim)``.
-        edges: Derivatives of positions at the points, shape ``(m, nq, gdim, gdim - 1)``.
-        in_mesh: Area of each point in the mesh, shape ``(m, nq)``.
         around: Length of the way around the axis of a body of revolution, elsewhere 1.
     """
 
@@ -141,8 +139,6 @@ class Layout:
     extent: float
     distinct: NDArray[np.int64]
     positions: NDArray[np.float64]
-    edges: NDArray[np.float64]
-    in_mesh: NDArray[np.float64]
     around: NDArray[np.float64]
 
 
@@ -164,6 +160,7 @@ class Surface:
         axisymmetric: As given.
         what: As given.
         nq: Number of points on each facet.
+        reference_points: The points on each facet of the reference cell, ``(nq, tdim)`` each.
         element: The basix element of a facet.
         shapes: Its shape functions at the points, shape ``(nq, k)``.
         slopes: Their derivatives, shape ``(gdim - 1, nq, k)``.
@@ -205,7 +202,7 @@ class Surface:
         self.shapes: NDArray[np.float64] = table[0]
         self.slopes: NDArray[np.float64] = table[1:]
         corners = [basix.geometry(cell)[side] for side in basix.topology(cell)[dim]]
-        self._places = [at[0] + points @ (at[1 : dim + 1] - at[0]) for at in corners]
+        self.reference_points = [at[0] + points @ (at[1 : dim + 1] - at[0]) for at in corners]
         # (places of a facet's nodes among those of a cell, by its number there)
         self._nodes = [
             np.linalg.norm(
@@ -240,13 +237,10 @@ class Surface:
         distinct, places = np.unique(nodes, return_inverse=True)
         origin = self.particles.undeformed.origin
         X = x if origin is None else origin.x.array.reshape(-1, self.gdim)
-        edges, undeformed = (np.einsum("jqk,mki->mqij", self.slopes, y[nodes]) for y in (x, X))
-        in_mesh, self._areas = (
-            np.linalg.norm(normals(part), axis=2) * self._rule for part in (edges, undeformed)
-        )
+        self._areas = self._areas_of(X[nodes])
         middle = x[W.dofmap.list[cells]].mean(axis=1)
         centre = (self.shapes @ x[nodes]).mean(axis=1)
-        n = normals(edges).mean(axis=1)
+        n = normals(self._edges(x[nodes])).mean(axis=1)
         own = self.particles
         halves = own.trail.halves(own.global_index, own.num_global)
         narrows = (body.basix_cell() in SIMPLICES) | halves[cells]
@@ -264,8 +258,6 @@ class Surface:
             float(body.comm.allreduce(extent, MPI.MAX)),
             distinct,
             x[distinct],
-            edges,
-            in_mesh,
             around,
         )
         volume = self.particles.initial_volume[cells]
@@ -291,22 +283,17 @@ class Surface:
         return ROUND_OFF * self.layout.extent
 
     @property
-    def reference_points(self) -> list[NDArray[np.float64]]:
-        """The points on each facet of the reference cell, each of shape ``(nq, tdim)``."""
-        return self._places
-
-    @property
     def mesh_area_ratio(self) -> NDArray[np.float64]:
         """Area in the present mesh over that of the undeformed body, shape ``(m, nq)``."""
-        return np.asarray(self.layout.in_mesh / self._areas)
+        x = self.layout.positions[self.layout.own]
+        return np.asarray(self._areas_of(x) / self._areas)
 
     # -- How wide facets have become ------------------------------------------------------------
 
     def begin_step(self) -> None:
         """Note the stretch of facets at the last converged step, where a step begins."""
         x = self.own_nodes(converged=True)[self.layout.own]
-        edges = np.einsum("jqk,mki->mqij", self.slopes, x)
-        self.stretch = np.linalg.norm(normals(edges), axis=2) * self._rule / self._areas
+        self.stretch = self._areas_of(x) / self._areas
         if self.axisymmetric:
             around, now = self.layout.around, 2.0 * np.pi * np.abs((self.shapes @ x)[:, :, 0])
             # (a facet along the axis has no area)
@@ -332,19 +319,26 @@ class Surface:
 
     def mesh_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals in the present mesh, shape ``(m, nq, gdim)``."""
-        return self._outward(self.layout.edges)
+        return self._outward(self.layout.positions[self.layout.own])
 
     def undeformed_normals(self) -> NDArray[np.float64]:
         """Return outward unit normals of the undeformed body, as those in the present mesh."""
         origin = self.particles.undeformed.origin
         if origin is None:
             return self.mesh_normals()
-        x = origin.x.array.reshape(-1, self.gdim)[self.layout.nodes]
-        return self._outward(np.einsum("jqk,mki->mqij", self.slopes, x))
+        return self._outward(origin.x.array.reshape(-1, self.gdim)[self.layout.nodes])
 
-    def _outward(self, edges: NDArray[np.float64], which: Any = slice(None)) -> NDArray[np.float64]:
-        """Return outward unit normals of facets by the derivatives of their positions."""
-        n = self.layout.outward[which, None, None] * normals(edges)
+    def _edges(self, x: NDArray[Any]) -> NDArray[np.float64]:
+        """Return derivatives at points of facets with nodes x, ``(m, nq, gdim, gdim - 1)``."""
+        return np.moveaxis(self.slopes[:, None] @ x, 0, -1)
+
+    def _areas_of(self, x: NDArray[Any]) -> NDArray[np.float64]:
+        """Return areas of points of facets with nodes x, shape ``(m, nq)``."""
+        return np.asarray(np.linalg.norm(normals(self._edges(x)), axis=2) * self._rule)
+
+    def _outward(self, x: NDArray[Any], which: Any = slice(None)) -> NDArray[np.float64]:
+        """Return outward unit normals at points of facets with nodes x."""
+        n = self.layout.outward[which, None, None] * normals(self._edges(x))
         return np.asarray(n / np.linalg.norm(n, axis=2)[:, :, None])
 
     def positions(
@@ -366,17 +360,21 @@ class Surface:
         return np.asarray(self.layout.positions + d.reshape(-1, self.gdim)[self.layout.distinct])
 
     @property
-    def sizes(self) -> NDArray[np.float64]:
-        """Size of each undeformed facet, shape ``(m,)``."""
-        return np.asarray(self._areas.sum(axis=1) ** (1.0 / (self.gdim - 1)))
+    def size(self) -> float:
+        """Median of the sizes of undeformed facets (collective)."""
+        return self.median(self._areas.sum(axis=1) ** (1.0 / (self.gdim - 1)))
+
+    def median(self, values: NDArray[np.float64]) -> float:
+        """Return the median of values at facets, of all ranks (collective)."""
+        every: list[NDArray[np.float64]] = self.particles.mesh.comm.allgather(values)
+        return float(np.median(np.concatenate(every)))
 
     def normals(
         self, converged: bool = False, which: NDArray[np.int64] | None = None
     ) -> NDArray[np.float64]:
         """Return outward unit normals at the points, as the body is displaced, as positions."""
         chosen: Any = slice(None) if which is None else which
-        x = self.own_nodes(converged)[self.layout.own[chosen]]
-        return self._outward(np.moveaxis(self.slopes[:, None] @ x, 0, -1), chosen)
+        return self._outward(self.own_nodes(converged)[self.layout.own[chosen]], chosen)
 
     def force(
         self,

@@ -78,6 +78,21 @@ def test_the_closest_facet_is_that_of_a_search_among_all(kind, faced, degree):
 
 
 @pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("kind", [TRIANGLE, HEXAHEDRON])
+def test_a_facet_without_an_area_asks_for_smaller_steps(kind):
+    # As an MPMError, so that ranks agree on it also where a step is committed.
+    known, nodes, x, _ = near_a_body(kind)
+    gone = np.tile(nodes[:1, :1], (1, nodes.shape[1], 1))
+    where = np.full((1, x.shape[1] - 1), 0.3)
+    for call in (
+        lambda: known.project(x[:1], gone, where),
+        lambda: known.closest(gone[:, 0], None, np.concatenate([gone, nodes[1:]]), REACH),
+    ):
+        with pytest.raises(mpm.ConvergenceError, match="Facets of a Pair collapse"):
+            call()
+
+
+@pytest.mark.skip_in_parallel
 @pytest.mark.parametrize("degree", [1, 2, 3])
 @pytest.mark.parametrize("kind", [TRIANGLE, QUADRILATERAL, TETRAHEDRON, HEXAHEDRON])
 def test_shape_functions_are_those_of_basix_and_projections_are_upright(kind, degree):
