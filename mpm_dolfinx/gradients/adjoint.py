@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +30,7 @@ from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
 from ..reals import as_reals
 from ..stepping.trial import Trial
-from .backward import Backward, Record, Weights, no_weights
+from .backward import Backward, Record, Weights, copied, no_weights
 from .laws import Laws
 from .nearby import varying
 from .parameters import CHANGE, Parameter, as_parameter, largest
@@ -40,6 +40,9 @@ __all__ = ["Adjoint"]
 
 type Array = NDArray[np.float64]
 type Sides = tuple[Array, Array]
+
+#: Of so many steps what materials keep is noted once, and found again for the others.
+KEPT = 8
 
 
 @dataclass
@@ -201,10 +204,9 @@ class Adjoint:
             self._records[-1].after if self._records else before,
             [np.array(body.displacement.x.array) for body in problem.bodies],
             [field.u.array_r.copy() for field in trial.reduced.fields],
-            [
-                [{name: v.copy() for name, v in own.items()} for own in points.last.memories()]
-                for points in problem.points
-            ],
+            []
+            if len(self._records) % KEPT
+            else copied([points.last.memories() for points in problem.points]),
             [array.copy() for array in self._data()],
         )
 
@@ -361,8 +363,7 @@ class Adjoint:
             [np.zeros_like(one.stiffness) for one in problem.setup.supports_of(body)]
             for body in problem.bodies
         ]
-        for number in range(len(self._records) - 1, -1, -1):
-            record = self._records[number]
+        for number, record in self._from_the_end(back):
             back.go_to(record, data)
             self._add_functional(look(number), weights)
             moved, backgrounds, laws = back.step(record, weights)
@@ -378,6 +379,12 @@ class Adjoint:
         for one, first in zip(self._many, self._first, strict=True):
             if one.parameter.of_law:
                 self._add_first(one, first, weights, penalised, stiffened)
+
+    def _from_the_end(self, back: Backward) -> Iterator[tuple[int, Record]]:
+        """Yield the steps from the last one, with their numbers and what materials kept."""
+        for first in reversed(range(0, len(self._records), KEPT)):
+            some = back.remembered(self._records[first : first + KEPT])
+            yield from reversed(list(enumerate(some, first)))
 
     def _add_law(self, place: int, law: Laws, motion: fem.Function, weights: Weights) -> None:
         """Add what the laws of a body depend on, and take weights to the step's beginning."""

@@ -40,7 +40,7 @@ from ..transfer.matrix import transfer_matrix
 from .laws import Laws
 from .nearby import add_product, varying
 
-__all__ = ["Backward", "Record", "Weights", "no_weights"]
+__all__ = ["Backward", "Record", "Weights", "copied", "no_weights"]
 
 type Array = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Record(NamedTuple):
         after: That at its end.
         increments: Of the background, on own dofs of V of each field.
         memories: What materials kept at its beginning, for each body, where displacements do not
-            tell it.
+            tell it; nothing where it is to be found again (:meth:`Backward.remembered`).
         data: What the forms hold besides.
     """
 
@@ -107,6 +107,35 @@ class Backward:
         self._problem, self._newton = problem, newton
         self._reduced = problem.reduced
 
+    def remembered(self, records: Sequence[Record]) -> list[Record]:
+        """Return successive steps, of which the first has memories, with the memories of all.
+
+        Raises:
+            MPMError: Materials do not answer as they did.
+        """
+        problem, found = self._problem, list(records[:1])
+        for record in records[1:]:
+            self._begin(found[-1])
+            for body, after in zip(problem.bodies, found[-1].after, strict=True):
+                body.displacement.x.array[:] = after
+            with ExitStack() as blocks:
+                for points in problem.points:
+                    blocks.enter_context(points.asked.without_tangents())
+                if (failure := self._reduced.terms.update()) is not None:
+                    raise failure
+            trials = [points.trial.memories() for points in problem.points]
+            found.append(record._replace(memories=copied(trials)))
+        return found
+
+    def _begin(self, record: Record) -> None:
+        """Go to the beginning of a step."""
+        for body, points, before, memories in zip(
+            self._problem.bodies, self._problem.points, record.before, record.memories, strict=True
+        ):
+            body.restore(before.copy().reshape(-1, body.mesh.geometry.dim))
+            body.roll_back()
+            points.recall(memories)
+
     def go_to(self, record: Record, data: Sequence[Array]) -> None:
         """Go to the end of a step, where all is as it was when that was solved.
 
@@ -120,12 +149,7 @@ class Backward:
         problem, reduced = self._problem, self._reduced
         for array, values in zip(data, record.data, strict=True):
             array[...] = values
-        for body, points, before, memories in zip(
-            problem.bodies, problem.points, record.before, record.memories, strict=True
-        ):
-            body.restore(before.copy().reshape(-1, body.mesh.geometry.dim))
-            body.roll_back()
-            points.recall(memories)
+        self._begin(record)
         reduced.unknowns.forget()
         none = [np.zeros(len(field.bodies[0].increment.x.array)) for field in reduced.fields]
         reduced.begin(none, 0.0)
@@ -237,6 +261,11 @@ class Backward:
             (force,) = term.stiffness_force([_vector(function)])
             found.append(force.array_r.copy())
         return found
+
+
+def copied(memories: Sequence[Sequence[State]]) -> list[list[State]]:
+    """Return what materials of bodies keep, as arrays that nobody else changes."""
+    return [[{name: v.copy() for name, v in own.items()} for own in body] for body in memories]
 
 
 def _gradients(body: Particles) -> list[PETSc.Mat]:

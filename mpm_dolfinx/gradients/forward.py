@@ -19,7 +19,6 @@ further evaluations, not accuracy.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -304,10 +303,7 @@ class StepDerivative:
         points = self._problem.points
         arrays = [function.x.array for function in motion]
         self._nearby.go(parameter, sign * parameter.change, rates, arrays)
-        with ExitStack() as blocks:
-            for own in points:
-                blocks.enter_context(own.asked.without_tangents())
-            self._require(self._reduced.balance.evaluate_beside(), parameter)
+        self._require(self._reduced.balance.evaluate_beside(), parameter)
         forces = [force.array_r.copy() for force in self._reduced.unknowns.forces]
         if not whole:
             return _Side(forces, [], [], [])

@@ -178,8 +178,11 @@ class Sensitivity:
         problem = self.problem
         with self._nearby.held():
             step = StepDerivative(problem, trial, self._nearby)
-            pairs = zip(self._parameters, rates, strict=True)
-            found = [step.by(parameter, one) for parameter, one in pairs]
+            with ExitStack() as blocks:
+                for points in problem.points:
+                    blocks.enter_context(points.asked.without_tangents())
+                pairs = zip(self._parameters, rates, strict=True)
+                found = [step.by(parameter, one) for parameter, one in pairs]
         assert newton.x is not None and newton.F is not None
         if (failure := reduced.residual(newton.x, newton.F)) is not None:
             raise MPMError(failure.message)
