@@ -35,8 +35,6 @@ from numpy.typing import NDArray
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.parallel import exchange
-from mpm_dolfinx.solvers.multigrid import Multigrid
-from mpm_dolfinx.system import hierarchy
 
 COMM = MPI.COMM_WORLD
 #: Bytes of a number, and numbers that come over borders or that every rank has.
@@ -50,28 +48,37 @@ def received(matrix: PETSc.Mat) -> int:
     return BYTES * int(np.count_nonzero((columns < first) | (columns >= last)))
 
 
-def counted(counts: dict[str, int]) -> None:
-    """Count from now on what is exchanged and what is replicated."""
-    swap, offered, set_up = exchange.swap, hierarchy._offered, Multigrid.set
+def distinct(matrix: PETSc.Mat) -> int:
+    """Return how many columns the rows of this rank have entries in."""
+    return len(np.unique(matrix.getValuesCSR()[1]))
+
+
+def count_exchanged(counts: dict[str, int]) -> None:
+    """Count from now on what ranks exchange besides products."""
+    swap = exchange.swap
 
     def count_swap(comm: MPI.Comm, parts: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
         counts["exchanged"] += sum(p.nbytes for r, p in enumerate(parts) if r != comm.rank)
         return swap(comm, parts)
 
-    def count_offers(comm: MPI.Comm, entries: Any) -> Any:
-        found = offered(comm, entries)
-        counts["replicated"] += sum(part.nbytes for part in found)
-        return found
-
-    def count_levels(self: Multigrid, K: PETSc.Mat) -> None:
-        set_up(self, K)
-        counts["product"] = received(K)
-        counts["cycle"] = sum(map(received, (K, *self._products, *self._interpolations)))
-
     for module in list(sys.modules.values()):
         if getattr(module, "swap", None) is swap:
             module.swap = count_swap  # type: ignore[attr-defined]
-    hierarchy._offered, Multigrid.set = count_offers, count_levels  # type: ignore[method-assign]
+
+
+def count_levels(counts: dict[str, int], pc: PETSc.PC) -> None:
+    """Count what a V cycle brings from other ranks, and what all ranks have of its levels.
+
+    That is, for each coarse dof that a rank's rows of the finest interpolation have, its number,
+    the rank, and how much that uses it: by these the dofs are given to ranks.
+    """
+    levels = range(1, pc.getMGLevels())
+    operators = [pc.getMGSmoother(level).getOperators()[0] for level in levels]
+    interpolations = [pc.getMGInterpolation(level) for level in levels]
+    coarsest = pc.getMGCoarseSolve().getOperators()[0]
+    counts["product"] = received(operators[-1])
+    counts["cycle"] = sum(map(received, (*operators, coarsest, *interpolations)))
+    counts["replicated"] = 3 * BYTES * COMM.allreduce(distinct(interpolations[-1]))
 
 
 def run(n: int) -> dict[str, Any]:
@@ -82,8 +89,9 @@ def run(n: int) -> dict[str, Any]:
     statistics = problem.history.statistics
     before = statistics["krylov_iterations"]
     counts = dict.fromkeys((*BORDER, *WHOLE), 0)
-    counted(counts)
+    count_exchanged(counts)
     step = next(path)
+    count_levels(counts, problem.solver.getKSP().getPC())
     unknowns = statistics["free_dofs"]
     return {
         "ranks": COMM.size,
