@@ -12,10 +12,12 @@ __all__ = [
     "DIFFERENCE",
     "EQUAL",
     "HALF_DIGITS",
+    "INEXACT",
     "LAST_PLACES",
     "LOCAL_ITERATIONS",
     "NEGLIGIBLE",
     "ROUND_OFF",
+    "SLIGHT",
     "SMALL",
     "SOLVED",
 ]
@@ -26,6 +28,10 @@ NEGLIGIBLE = 1e-9
 #: Share that decides nothing: above what round-off leaves of derivatives, fits and distances, below
 #: what anybody measures.
 SMALL = 1e-6
+#: Share that can be seen and does not matter, as of a motion that is rigid but for it.
+SLIGHT = 1e-3
+#: What may be left of a residual by what others go on with (inexact methods of Newton).
+INEXACT = 0.1
 #: Relative difference of numbers that are equal but for their last places.
 EQUAL = 1e-12
 #: What is left, relative to its parts, of a sum that vanishes: some hundred times the last place.

@@ -20,9 +20,6 @@ from ..tolerances import NEGLIGIBLE
 
 __all__ = ["box_weights", "cell_lines", "coarser", "grid_lines"]
 
-#: Slabs across a background in which the size of its cells is looked at.
-SLABS = 256
-
 
 def cell_lines(V: fem.FunctionSpace) -> list[NDArray[np.float64]]:
     """Return grid lines about as far from each other as the vertices of the background.
@@ -90,12 +87,14 @@ def _by_size(
     """Return lines whose distance is the mean extent of the cells around (collective)."""
     first = comm.allreduce(float(low.min(initial=np.inf)), MPI.MIN)
     last = comm.allreduce(float(high.max(initial=-np.inf)), MPI.MAX)
-    edges = np.linspace(first, last, SLABS + 1)
-    slab = np.clip(np.searchsorted(edges, 0.5 * (low + high)) - 1, 0, SLABS - 1)
-    sums = np.stack([np.bincount(slab, minlength=SLABS), np.bincount(slab, high - low, SLABS)])
+    cells, whole = comm.allreduce(np.array([len(low), float((high - low).sum())]))
+    slabs = max(round((last - first) * cells / whole), 1)  # as wide as a cell is
+    edges = np.linspace(first, last, slabs + 1)
+    slab = np.clip(np.searchsorted(edges, 0.5 * (low + high)) - 1, 0, slabs - 1)
+    sums = np.stack([np.bincount(slab, minlength=slabs), np.bincount(slab, high - low, slabs)])
     count, extent = comm.allreduce(sums)
     known = np.flatnonzero(count)
-    size = np.interp(np.arange(SLABS), known, extent[known] / count[known])
+    size = np.interp(np.arange(slabs), known, extent[known] / count[known])
     passed = np.concatenate([[0.0], np.cumsum(np.diff(edges) / size)])
     number = max(round(float(passed[-1])), 1)
     return np.interp(np.linspace(0.0, passed[-1], number + 1), passed, edges)

@@ -21,6 +21,7 @@ from ..materials.base import Material, State
 from ..problems.problem import Problem
 from ..problems.quasistatic import QuasiStaticProblem
 from ..reals import as_reals
+from ..tolerances import DIFFERENCE
 
 __all__ = ["Parameter", "as_parameter", "largest"]
 
@@ -28,7 +29,7 @@ type Array = NDArray[np.float64]
 
 #: Changes that differences are made of, relative to the parameter. Points between two branches of
 #: a law are the fewer the smaller it is; 1e-5 to 1e-7 give derivatives to ten digits.
-CHANGE = 1e-6
+CHANGE = DIFFERENCE
 
 
 class Parameter(ABC):

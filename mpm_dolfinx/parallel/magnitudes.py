@@ -21,8 +21,9 @@ from .totals import over_ranks
 
 __all__ = ["joint_norm", "norm", "sign_of_product", "unit_sized"]
 
-#: Sizes whose squares, and sums of as many of them as there are unknowns, are safe.
-SAFE = (1e-140, 1e140)
+FLOAT = np.finfo(float)
+#: Sizes whose squares are numbers of all digits, and sums of 1/eps of these too.
+SAFE = float(np.sqrt(FLOAT.tiny / FLOAT.eps)), float(np.sqrt(FLOAT.max * FLOAT.eps))
 
 
 def _exponent(largest: float) -> int:

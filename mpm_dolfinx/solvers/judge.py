@@ -11,7 +11,16 @@ import numpy as np
 from ..errors import ConvergenceError
 from ..history import Statistics
 from ..parallel.magnitudes import norm
-from ..tolerances import EQUAL, HALF_DIGITS, LAST_PLACES, NEGLIGIBLE, ROUND_OFF
+from ..tolerances import (
+    EQUAL,
+    HALF_DIGITS,
+    INEXACT,
+    LAST_PLACES,
+    NEGLIGIBLE,
+    ROUND_OFF,
+    SLIGHT,
+    SMALL,
+)
 from .linear import ShiftedFactor
 from .mechanism import mechanism, not_held
 from .problem import ReducedProblem
@@ -19,11 +28,6 @@ from .residual import Residual
 from .steps import Steps
 
 __all__ = ["Judge"]
-
-#: Share of the residual that the proximal term may go on to hold back where it is released.
-HELD = 0.1
-#: Share of the forces that the proximal term may bear in the first step.
-LOOSE = 1e-3
 
 
 class Judge:
@@ -74,9 +78,9 @@ class Judge:
             scale: Size of those from outside.
         """
         if self._stalled or scale == 0.0:
-            if scale < 1e-5 * self._internal:
+            if scale < 10.0 * SMALL * self._internal:
                 self._internal = self._problem.balance.internal_scale()
-            if scale < 1e-6 * self._internal:
+            if scale < SMALL * self._internal:
                 return self._internal
         return scale
 
@@ -165,7 +169,7 @@ class Judge:
         while (left > self.tolerance or always) and self._factor.D is not None:
             always = False
             self._factor.solve(residual.F, step)
-            if residual.held(step) > HELD * left:
+            if residual.held(step) > INEXACT * left:
                 self._factor.refine(residual.F, step, 0.5 * self.tolerance / left)
             self._problem.constrain(step, x, self._steps.solve)
             if not (residual.at(x - step) is None and norm(residual.F) <= 0.5 * left):
@@ -223,7 +227,7 @@ class Judge:
         if self._factor.D is None or scale == 0.0 or not np.isfinite(norm(y)):
             return
         share = self._residual.held(y) / scale
-        if share <= LOOSE:
+        if share <= SLIGHT:
             return
         problem = self._problem
         loose = mechanism(problem.resistance, self._factor, y)

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import ConvergenceError, MPMError
 from ..history import Statistics
 from ..parallel.totals import over_ranks
-from ..tolerances import HALF_DIGITS, SOLVED
+from ..tolerances import HALF_DIGITS, INEXACT, SOLVED
 from .multigrid import Multigrid
 from .problem import Levels
 from .refinement import KRYLOV, Refinement
@@ -31,9 +31,9 @@ __all__ = ["ShiftedFactor"]
 COARSEST = 600
 #: Relative residual of what multigrid solves besides Newton's steps, and its most iterations.
 ACCURATE, ITERATIONS = 1e-6, 200
-#: Relative residuals of the first and the roughest of Newton's steps by multigrid (Eisenstat &
-#: Walker 1996), and what is left of a residual's tolerance by one that is to meet it.
-FIRST, ROUGHEST, FINAL = 1e-2, 0.1, 0.2
+#: Relative residual of the first of Newton's steps by multigrid (Eisenstat & Walker 1996), and
+#: what is left of a residual's tolerance by one that is to meet it.
+FIRST, FINAL = 1e-2, 0.2
 #: Tries of a step that end where a tangent is indefinite, before it is solved with all the same.
 PATIENCE = 3
 #: How packages that factorise write themselves.
@@ -406,14 +406,14 @@ class ShiftedFactor:
         rtol = min(FIRST, self._bent)
         if len(norms) > 1 and norms[-2] > 0.0:
             golden = 0.5 * (1.0 + math.sqrt(5.0))  # Eisenstat & Walker's exponent
-            rtol = min(float((norms[-1] / norms[-2]) ** golden), ROUGHEST)
+            rtol = min(float((norms[-1] / norms[-2]) ** golden), INEXACT)
             if self._left is not None:
                 missed = abs(norms[-1] - self._left) / norms[-2]
                 rtol = min(rtol, missed)
                 if len(norms) == 2:
                     self._curved = missed
         if norms and norms[-1] > 0.0:
-            rtol = max(rtol, min(FINAL * tolerance / norms[-1], ROUGHEST))
+            rtol = max(rtol, min(FINAL * tolerance / norms[-1], INEXACT))
         rtol = max(rtol, SOLVED)
         self._ksp.setTolerances(rtol=rtol, max_it=self._longest)
 
@@ -501,7 +501,7 @@ class ShiftedFactor:
         Near the floor of round-off a tangent with directions that nothing holds looks indefinite.
         """
         reason = self._ksp.getConvergedReason()
-        limit = FIRST if reason in INDEFINITE else ROUGHEST
+        limit = FIRST if reason in INDEFINITE else INEXACT
         done = reason in INDEFINITE or reason == PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT
         return done and bool(self._ksp.getResidualNorm() <= limit * b.norm())
 

@@ -24,8 +24,6 @@ __all__ = ["GhostPenalty"]
 
 #: Ghost penalty over shear modulus / cell size^2.
 PENALTY = 1e-4
-#: Shapes of pairs whose matrices are kept; an unstructured background has as many as pairs.
-MOST_SHAPES = 1000
 
 
 class GhostPenalty:
@@ -124,10 +122,10 @@ class GhostPenalty:
         return blocked(self._V, rows.ravel(), columns.ravel(), values.ravel(), bs)
 
     def _penalties(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the matrices of pairs of cells, each shape of a pair computed once for all.
+        """Return the matrices of pairs of cells, each shape of a pair computed once.
 
-        What is kept is known by its vertices to the last bit, so that a run that goes on from a
-        checkpoint has the same matrices as one that has kept them.
+        Those of the last call are kept, and known by their vertices to the last bit, so that a run
+        that goes on from a checkpoint has the same matrices as one that has kept them.
 
         Args:
             vertices: Geometry nodes of both cells, shape ``(n, 2, m, gdim)``.
@@ -139,11 +137,11 @@ class GhostPenalty:
         _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         names = [one.tobytes() for one in shape[first]]
         new = [i for i, name in enumerate(names) if name not in self._known]
+        known = {name: self._known[name] for name in names if name in self._known}
         if len(new) > 0:
-            if len(self._known) + len(new) > MOST_SHAPES:
-                self._known, new = {}, list(range(len(names)))
             matrices = self._unit_penalties(shape[first[new]])
-            self._known.update(zip([names[i] for i in new], matrices, strict=True))
+            known.update(zip([names[i] for i in new], matrices, strict=True))
+        self._known = known
         if n == 0:
             k = 2 * self._cells.nodes.shape[1]
             return np.zeros((0, k, k))

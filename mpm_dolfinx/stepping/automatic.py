@@ -18,7 +18,8 @@ from ..parallel.magnitudes import joint_norm
 from ..particles.particles import Particles
 from ..reals import as_reals
 from ..system.reduced import ReducedSystem
-from .control import LIMIT_HALVINGS, LIMIT_WIDTH, MOST_HALVINGS, Control, StepControl
+from ..tolerances import EQUAL, NEGLIGIBLE, SLIGHT
+from .control import LIMIT_HALVINGS, MOST_HALVINGS, Control, StepControl
 
 __all__ = ["ErrorControl", "StepError", "control_of", "error_of_step"]
 
@@ -193,14 +194,14 @@ class ErrorControl:
     @property
     def _smallest(self) -> bool:
         """Whether no smaller step than the present one is tried; its size has a round-off."""
-        return self.target - self._now <= self._least * (1.0 + 1e-3)
+        return self.target - self._now <= self._least * (1.0 + SLIGHT)
 
     @property
     def target(self) -> float:
         """End of the step to try: a level, or no further than halfway to the next."""
         level = self._level
         left = level - self._now
-        if self._size >= left * (1.0 - 1e-9):
+        if self._size >= left * (1.0 - NEGLIGIBLE):
             return level
         return self._now + min(self._size, 0.5 * left)  # no short step is left over
 
@@ -256,7 +257,7 @@ class ErrorControl:
         """Go to the target, and choose the next step by the error that was judged last."""
         now = self.target
         tried = now - self._now
-        ratio = max(self._ratio, 1e-12)
+        ratio = max(self._ratio, EQUAL)
         factor = SAFETY * float(ratio**-PROPORTIONAL)
         if self._before is None:
             factor = SAFETY / math.sqrt(ratio)
@@ -281,7 +282,7 @@ class ErrorControl:
             gave_up: As in :meth:`StepControl.cut_back`.
         """
         tried = self.target - self._now
-        limit = tried <= FIRST / 2**LIMIT_HALVINGS and tried <= LIMIT_WIDTH * self._now
+        limit = tried <= FIRST / 2**LIMIT_HALVINGS and tried <= SLIGHT * self._now
         if self._smallest or (gave_up and limit):
             return False
         self._size, self._holds = max(0.5 * tried, self._least), True

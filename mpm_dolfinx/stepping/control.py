@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..tolerances import SLIGHT
 from .adaptivity import Adaptivity
 
 __all__ = ["Control", "Converged", "Progress", "Run", "StepControl"]
@@ -22,10 +23,8 @@ EASY = 8
 #: Steps of one size after which a larger one is tried, however many linear solves they took; twice
 #: as many each time that such a try has failed.
 PATIENCE = 3
-#: Halvings, and width of a bracket relative to the load, from which a load that no step gets
-#: over counts as a limit.
+#: Halvings from which a load that no step gets over counts as a limit, where its bracket is narrow.
 LIMIT_HALVINGS = 6
-LIMIT_WIDTH = 1e-3
 
 
 class Control(Protocol):
@@ -153,7 +152,7 @@ class StepControl:
                 one and of 1/1000 of the load reached is the smallest.
         """
         limit = self._size <= max(1, self._largest >> LIMIT_HALVINGS) and (
-            self._size <= LIMIT_WIDTH * self._now
+            self._size <= SLIGHT * self._now
         )
         self._wary = self._wary or (self._failed is not None and self._moved)
         end = self._now + self._size

@@ -30,8 +30,6 @@ __all__ = ["count_folded", "improper", "placed"]
 #: Share of the bodies' largest motion from which on it is that of a node of the background which is
 #: held by next to nothing.
 ASTRAY = 0.5
-#: How often a particle begins or ceases to yield, late in a solve, that flips to and fro.
-FLIPS = 2
 
 
 def improper(bodies: Sequence[Particles], materials: Sequence[MaterialPoints]) -> MPMError | None:
@@ -152,12 +150,12 @@ def _astray(field: Field) -> _Astray:
 def _flipping(reduced: ReducedSystem, flips: Sequence[NDArray[np.int64]]) -> str:
     """Say how many particles begin and cease to yield by turns, and where (collective)."""
     comm: MPI.Comm = reduced.bodies[0].V.mesh.comm
-    which = comm.allgather([np.flatnonzero(each >= FLIPS) for each in flips])
+    which = comm.allgather([np.flatnonzero(each > 1) for each in flips])
     count = sum(len(each) for rank in which for each in rank)
     if count == 0:
         return ""
     bodies = [body for body in reduced.bodies if isinstance(body, Particles)]
-    places = [body.centroid[each >= FLIPS] for body, each in zip(bodies, flips, strict=False)]
+    places = [body.centroid[each > 1] for body, each in zip(bodies, flips, strict=False)]
     x = np.concatenate([p for rank in comm.allgather(places) for p in rank])
     where = tuple(float(f"{c:.4g}") for c in np.median(x, axis=0))
     return f"; {count} particles around {where} flip between elastic and plastic"

@@ -35,9 +35,6 @@ from .trial import Owner, Path, Trial
 
 __all__ = ["Mender", "Stepper"]
 
-#: How often nodes are freed at the end of a step.
-MOST_FREED = 10
-
 
 class Mender(Protocol):
     """Changes of the bodies' meshes between steps. All calls are collective."""
@@ -313,7 +310,7 @@ class Stepper:
         """
         trial = self.trial
         owner, steps = trial.owner, trial.owner.history.steps
-        for tries in range(MOST_FREED + 1):
+        while True:  # (each time other nodes are freed, of which there are so many)
             try:
                 with owner.history.statistics.phase("assemble"):
                     terms = trial.solver.system.body_terms
@@ -322,7 +319,7 @@ class Stepper:
                 break
             steps[-1] = step = replace(step, error=errors.total(owner.bodies))
             chosen = adaptivity.chosen(owner.bodies, errors)
-            if not chosen or tries == MOST_FREED:
+            if not chosen:
                 break
             freed = trial.nodes.free(chosen)
             try:

@@ -25,15 +25,13 @@ from ..solvers.newton import NewtonSolver
 from ..solvers.problem import ReducedProblem
 from ..system.body import BodyTerm
 from ..system.reduced import ReducedSystem
-from ..tolerances import SMALL
+from ..tolerances import INEXACT, SMALL
 from .control import Converged
 from .displacement_control import ControlledSystem, DisplacementControl
 from .leaving import Masses, move_bodies
 
 __all__ = ["Goal", "StepSolver", "System", "set_load"]
 
-#: What an alternation may leave of the residual that it begins with.
-INEXACT = 0.1
 #: How much farther a body may move for the same controlled displacement than in the step before.
 JUMP = 10.0
 #: Alternations after which a step is given up.

@@ -27,6 +27,7 @@ from ..particles.free import FreeNodes
 from ..particles.particles import Particles
 from ..stabilisation.ghost_penalty import GhostPenalty
 from ..stabilisation.joints import Joints
+from ..tolerances import SLIGHT, SMALL
 from ..transfer.touched import TouchedNodes, TransferRows
 from .conditions import Prescribed
 from .hierarchy import Boxes, FieldDofs
@@ -35,13 +36,6 @@ from .on_background import OnBackground
 from .predictor import map_to_background
 
 __all__ = ["Field", "Motion"]
-
-#: Change of values, relative to themselves, that counts as none: a residual that is small beside
-#: what it does is round-off.
-NOTHING = 1e-5
-
-#: What a rigid motion may leave of a motion that counts as one.
-RIGID = 1e-3
 
 
 class Motion:
@@ -102,7 +96,7 @@ class Motion:
         """Return sizes of the last change on own dofs of W, at least a share of the values'."""
         increment = self.increment()
         values = self.particles.displacement.x.array[: len(increment)]
-        return np.asarray(np.abs(increment) + NOTHING * np.abs(values))
+        return np.asarray(np.abs(increment) + SMALL * np.abs(values))
 
     def of(self, u: PETSc.Vec) -> PETSc.Vec:
         """Return ``T u``, in a vector that the next call changes."""
@@ -135,7 +129,7 @@ class Motion:
         A = np.column_stack(motions)
         normal, right = comm.allreduce(A.T @ A), comm.allreduce(A.T @ moved.ravel())
         rest = moved.ravel() - A @ np.linalg.lstsq(normal, right, rcond=None)[0]
-        return joint_norm(rest, comm) <= RIGID * joint_norm(moved.ravel(), comm)
+        return joint_norm(rest, comm) <= SLIGHT * joint_norm(moved.ravel(), comm)
 
     def nodal_size(self, force: PETSc.Vec) -> NDArray[np.float64]:
         """Return the size of ``T f`` at this rank's nodes."""

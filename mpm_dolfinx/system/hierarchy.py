@@ -30,11 +30,6 @@ from .numbering import FreeDofs
 
 __all__ = ["Boxes", "FieldDofs", "interpolations"]
 
-#: Dofs up to which a level lives on one rank.
-GATHERED = 3000
-#: Share of the dofs above which a coarser level is not worth its while.
-FEWER = 0.7
-
 
 class FieldDofs(NamedTuple):
     """Dofs of a field on one level.
@@ -150,8 +145,8 @@ def interpolations(
     sums = _offered(comm, entries)
     owner: NDArray[np.int64] | None = None  # of the dofs of all ranks, below the finest level
     while total > coarsest:
-        dofs, homes = _homes(sums, comm.size)
-        if len(dofs) > FEWER * total:
+        dofs, homes = _homes(sums, comm.size, coarsest)
+        if len(dofs) >= total:
             break
         order = np.lexsort((dofs, homes))
         numbers = np.empty(len(dofs), dtype=np.int64)
@@ -203,13 +198,16 @@ def _offered(comm: MPI.Comm, entries: _Entries) -> _Sums:
     return dofs, ranks, sums
 
 
-def _homes(offers: _Sums, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all coarse dofs, sorted, and the rank of each: which uses it most, or the first."""
+def _homes(offers: _Sums, size: int, coarsest: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return all coarse dofs, sorted, and the rank of each: which uses it most.
+
+    Those of the coarsest level are the first rank's.
+    """
     dofs, ranks, sums = offers
     order = np.lexsort((ranks, -sums, dofs))
     found, first = np.unique(dofs[order], return_index=True)
     homes = ranks[order][first]
-    if len(found) <= GATHERED and size > 1:
+    if len(found) <= coarsest and size > 1:
         homes = np.zeros_like(homes)
     return found, homes
 
