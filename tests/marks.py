@@ -7,12 +7,12 @@ import re
 import pytest
 
 #: Of a family on several ranks: prime to the sizes of most products of parameters.
-EVERY = 7
+EVERY = 11
 #: Whole runs, whose answers one rank has looked at, and how many of them several ranks do again.
 WHOLE_RUNS = re.compile(
     r"tests/(contact|plot|solvers|stepping)/|/test_(averaging|mixed|porous|stages|supports)\.py"
 )
-SOME = 3
+SOME = 4
 #: What ranks do together in them: tests that say so stay.
 TOGETHER = re.compile(
     "checkpoint|combination|ends_on|fail|feature|interrupt|mesh|no_sense|refuse|repartition|"

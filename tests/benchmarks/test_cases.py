@@ -17,9 +17,10 @@ import mpm_dolfinx as mpm
 
 CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 #: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
-SHORT = ("compaction", "column_free", "snap_through")
+SHORT = ("compaction", "column_free")
 LONG = {
     *("sand-damped", "sand-dilates", "notch", "retrogression"),
+    *("gradient", "hertz-pair", "weight-recommended", "circle-recommended", "incline", "sand"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     "indentation",
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),

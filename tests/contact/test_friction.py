@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from compare import raises
+from marks import slow
 from obstacles import dragged
 from pairs import two
 from scenes import WORLD
@@ -113,7 +114,7 @@ def slipped(touch):
 SCENES = [on_obstacle, between_bodies]
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", [on_obstacle, *slow(between_bodies)])
 def test_a_law_that_wears_to_where_it_was_is_coulombs(scene):
     found = []
     for law in (Wear(0.3, 0.3), contact.Coulomb(0.3)):

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from marks import slow
 from scenes import QUADRILATERAL, box
 
 import mpm_dolfinx as mpm
@@ -67,7 +68,7 @@ def test_turns_between_poses():
         assert flat[1].least_turn_from(flat[0]) == pytest.approx(angle, rel=1e-9)
 
 
-@pytest.mark.parametrize("scheme", ["euler", "conserving"])
+@pytest.mark.parametrize("scheme", ["conserving", *slow("euler")])
 def test_a_body_that_spins_fast_turns_as_far_as_it_should(scheme):
     V = scenes.vectors(box([0.0, -0.2], [2.0, 3.0], [5, 8], QUADRILATERAL))
     body = mpm.Particles(box([0.2, 0.0], [1.8, 1.0], [4, 3], QUADRILATERAL), V)

@@ -17,7 +17,7 @@ from marks import all_but
 DEMOS = Path(__file__).parents[2] / "demos"
 NAMES = sorted(path.stem for path in DEMOS.glob("*.py"))
 #: Those of a second or two, which ``make test`` runs.
-SHORT = ("demo_column_roller", "demo_collapse", "demo_gmsh_body", "demo_snap_through")
+SHORT = ("demo_column_roller", "demo_gmsh_body")
 
 
 KEPT = DEMOS.parent / "docs" / "images" / "demos"

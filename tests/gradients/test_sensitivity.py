@@ -132,7 +132,7 @@ RUNS = {
 }
 
 
-@pytest.mark.parametrize("run", all_but(["by hand", "to others"], RUNS))
+@pytest.mark.parametrize("run", all_but(["to others"], RUNS))
 def test_each_way_to_run(run):
     check(lambda **v: Loaded(**v), LOADS, ["young", "moved", "stress"], change=1e-5, run=RUNS[run])
 

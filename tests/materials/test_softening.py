@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from laws import assert_as_in_python, in_python
+from marks import thinned
 from materials.test_von_mises import random_path
 
 from mpm_dolfinx import MPMError
@@ -45,8 +46,9 @@ LAWS = {
 }
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(
+    ("name", "dim"), thinned(3, [(name, dim) for dim in (3, 2) for name in LAWS])
+)
 def test_tangent_with_an_average_is_the_derivative(name, dim):
     law = LAWS[name].softening_by(AVERAGE)
     assert check_tangent(law, dim, strain=0.05, steps=6) < 1e-8
