@@ -80,6 +80,12 @@ class SofteningMaterial(PlasticMaterial):
         """Return the last parameters of a compiled law that softens by an average."""
         return self.parameters["decay"], MIXTURE * self.parameters["average"], MIXTURE - 1.0
 
+    @property
+    @override
+    def is_differentiable(self) -> bool:
+        # (the strength, which the compiled return is given, depends on the state)
+        return super().is_differentiable and not self.softens
+
     @override
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
         if self._softens_at_once():

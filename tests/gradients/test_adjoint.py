@@ -233,6 +233,26 @@ def test_a_law_that_remembers_without_being_inelastic():
     assert np.abs(one / other - 1.0).max() < 1e-8, (one, other)
 
 
+@pytest.mark.parametrize("law", ["Tresca", "von Mises"])
+def test_a_strength_that_falls_with_the_history(law):
+    """It is no number of the compiled return alone: by that, derivatives are off by 1e-3."""
+
+    def prepared():
+        def softening(young):
+            if law == "Tresca":
+                return materials.Tresca(young, 0.45, 500.0).with_softening(5.0, cohesion=400.0)
+            return materials.VonMises(young, 0.3, 700.0).with_softening(5.0, residual=0.8)
+
+        scene = Slump(softening, {"young": 5e4, "weight": 1e3})
+        d = scene.particles.displacement
+        parameters = [scene.named[name] for name in ("young", "weight")]
+        form = 0.5 * ufl.inner(d, d) * ufl.dx
+        return scene.problem, parameters, form, lambda: scene.problem.solve(4)
+
+    one, other = both_ways(prepared)
+    assert np.abs(one / other - 1.0).max() < 1e-7, (one, other)
+
+
 def test_what_materials_keep_is_found_again_where_it_was_not_noted():
     """Of eight steps it is noted once."""
 
