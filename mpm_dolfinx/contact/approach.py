@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import basix
 
 from .facets import Closest, separated
-from .memory import FacetMemory
+from .memory import FacetMemory, spread
 from .neighbourhood import Neighbourhood
 
 __all__ = ["LINGER", "Approach", "OverStep"]
@@ -96,12 +96,9 @@ class Approach:
         s = around.project(x[keep], nodes[before.facet[keep]], before.place[keep])
         beside = np.abs(s - around.clamped(s)).max(axis=1, initial=0.0)
         keep, s = keep[beside < LINGER], s[beside < LINGER]
-        facet, place = found.facet.copy(), found.place.copy()
-        gap, near = found.gap.copy(), found.near.copy()
-        facet[keep] = before.facet[keep]
-        gap[keep], _ = self._gaps(s, x[keep], nodes[facet[keep]], facet[keep])
-        place[keep], near[keep] = s, True
-        return Closest(facet, place, gap, near, found.beside)
+        facet = before.facet[keep]
+        gap, _ = self._gaps(s, x[keep], nodes[facet], facet)
+        return found.with_some(keep, facet=facet, place=s, gap=gap, near=True)
 
     def over_step(self, found: Closest, within: NDArray[np.bool_]) -> OverStep:
         """Return which points touch at the end of a step and in the whole of it.
@@ -118,11 +115,9 @@ class Approach:
         at = near.find(last.closest[lost])
         lost, at = lost[at >= 0], at[at >= 0]
         if len(lost):
-            facet, place, gap = found.facet.copy(), found.place.copy(), found.gap.copy()
-            place[lost] = self._place(x[lost], nodes[at])
-            gap[lost], _ = self._gaps(place[lost], x[lost], nodes[at], at)
-            facet[lost] = at
-            found = found._replace(facet=facet, place=place, gap=gap)
+            place = self._place(x[lost], nodes[at])
+            gap, _ = self._gaps(place, x[lost], nodes[at], at)
+            found = found.with_some(lost, facet=at, place=place, gap=gap)
         before, begins = self._before_step(found)
         sideways = within & ~last.within & (before < -touch)
         offset = np.where(last.within, np.clip(found.gap, begins, 0.0), 0.0)
@@ -204,14 +199,10 @@ class Approach:
         there = near.closest(self.x[which], self.normals()[which], self.nodes, reach)
         moves = there.near & (there.facet >= 0) & (there.facet != found.facet[which])
         which = which[moves]
-        facet, place, gap = found.facet.copy(), found.place.copy(), found.gap.copy()
-        depth = gap[which] - offset[which]
-        facet[which], place[which], gap[which] = (
-            part[moves] for part in (there.facet, there.place, there.gap)
-        )
-        offset = offset.copy()
-        offset[which] = np.minimum(gap[which] - depth, 0.0)
-        return found._replace(facet=facet, place=place, gap=gap), offset
+        facet, place, gap = (part[moves] for part in (there.facet, there.place, there.gap))
+        depth = found.gap[which] - offset[which]
+        offset = spread(np.minimum(gap - depth, 0.0), which, offset)
+        return found.with_some(which, facet=facet, place=place, gap=gap), offset
 
     def located(
         self, points: NDArray[np.float64], otherwise: NDArray[np.int64]

@@ -14,7 +14,7 @@ from ..particles.particles import Particles
 from ..system.own import OwnUnknowns
 from ..system.term import Term
 from .rigid_motion import RigidMotion
-from .rotation import Pose
+from .rotation import Pose, crossing
 from .shapes import as_point, as_rotation
 
 __all__ = ["Driven", "KeptMotion"]
@@ -94,22 +94,28 @@ class Driven(Term):
     @property
     def kinetic_energy(self) -> float:
         """Kinetic energy."""
-        return self._motion.kinetic_energy
+        state, motion = self._motion.last, self._motion
+        turning = float(state.spin @ motion.inertia @ state.spin)
+        return 0.5 * (motion.mass * float(state.velocity @ state.velocity) + turning)
 
     @property
     def potential_energy(self) -> float:
         """Energy in the field of gravity, zero at the beginning."""
-        return self._motion.potential_energy
+        return -self._motion.mass * float(self._motion.gravity @ self._motion.last.place)
 
     @property
     def momentum(self) -> NDArray[np.float64]:
         """Momentum, shape ``(gdim,)``."""
-        return self._motion.momentum
+        return self._motion.mass * self._motion.last.velocity
 
     @property
     def angular_momentum(self) -> NDArray[np.float64]:
         """Angular momentum about the origin, ``(1,)`` or ``(3,)``."""
-        return self._motion.angular_momentum
+        state = self._motion.last
+        turning = self._motion.inertia @ state.spin
+        if len(turning) == 3:
+            turning = state.Q @ turning
+        return np.asarray(turning + crossing(self.centre).T @ self.momentum)
 
 
 class KeptMotion(Kept):

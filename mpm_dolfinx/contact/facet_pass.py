@@ -37,7 +37,7 @@ FREEZE = 12
 type Array = NDArray[np.float64]
 
 
-class State(NamedTuple):
+class Past(NamedTuple):
     """Points at the last converged step.
 
     Attributes:
@@ -48,8 +48,13 @@ class State(NamedTuple):
     memory: FacetMemory
     outcome: Outcome
 
+    @property
+    def friction(self) -> Array:
+        """What the law of friction remembers, shape ``(n, k)``."""
+        return self.memory.friction
 
-class FacetPass(Pass[State, Meeting]):
+
+class FacetPass(Pass[Past, Meeting]):
     """Points of one body against facets of another, on meshes that stay the same (collective).
 
     In a step it looks at those points alone that may come near to a facet.
@@ -103,18 +108,8 @@ class FacetPass(Pass[State, Meeting]):
 
     @property
     @override
-    def told(self) -> Outcome:
-        return self.state.outcome
-
-    @property
-    @override
     def anchors(self) -> Array:
         return self.state.memory.anchors.reshape(self.told.positions.shape)
-
-    @property
-    @override
-    def rubbed(self) -> Array:
-        return self.state.memory.friction
 
     # -- Beginnings -------------------------------------------------------------------------------
 
@@ -130,7 +125,7 @@ class FacetPass(Pass[State, Meeting]):
         followed = None if memory is None else memory.facet >= 0
         return Neighbourhood(self._sides, mine, nodes, followed)
 
-    def _anew(self) -> tuple[State, Approach]:
+    def _anew(self) -> tuple[Past, Approach]:
         """Return the state at converged positions, of points that nothing has touched yet."""
         around, near = self._around, self._around.near
         at = self.source.positions(converged=True)
@@ -149,7 +144,7 @@ class FacetPass(Pass[State, Meeting]):
         base = untouched(at)
         gap = np.where(found.near, found.gap, np.inf).reshape(-1, self.source.nq)
         outcome = base._replace(gap=spread(gap, around.facets, base.gap))
-        return State(whole.with_some(around.which, known), outcome), approach
+        return Past(whole.with_some(around.which, known), outcome), approach
 
     # -- What is kept ---------------------------------------------------------------------------
 
@@ -178,7 +173,7 @@ class FacetPass(Pass[State, Meeting]):
             anchors=anchors,
             friction=worn(columns.get("friction"), memory.friction),
         )
-        self.state = State(known, retold(self.state.outcome, columns))
+        self.state = Past(known, retold(self.state.outcome, columns))
 
     # -- A step ---------------------------------------------------------------------------------
 
@@ -297,7 +292,7 @@ class FacetPass(Pass[State, Meeting]):
         self.evaluation.add_tangents(factor, into)
 
     @override
-    def after(self) -> State:
+    def after(self) -> Past:
         """Return the state after the last evaluation.
 
         Raises:
@@ -308,4 +303,4 @@ class FacetPass(Pass[State, Meeting]):
             raise ConvergenceError(
                 "A body goes through the other one of a Pair in one step; take smaller steps"
             )
-        return State(*self.evaluation.state(self.state.memory.friction))
+        return Past(*self.evaluation.state(self.state.memory.friction))

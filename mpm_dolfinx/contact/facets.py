@@ -8,7 +8,7 @@ a grid, so that the cost grows with the number of points and facets, not with it
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mpi4py import MPI
 
@@ -57,6 +57,13 @@ class Closest(NamedTuple):
         """Return the closest facets of n points to which none is near."""
         facet, gap, place = np.full(n, -1, dtype=np.int64), np.full(n, np.inf), np.zeros((n, e))
         return cls(facet, place, gap, np.zeros(n, dtype=bool), np.zeros(n))
+
+    def with_some(self, which: NDArray[np.int64], **parts: Any) -> Closest:
+        """Return these with other values of some points, by names."""
+        for name, values in parts.items():
+            whole = parts[name] = getattr(self, name).copy()
+            whole[which] = values
+        return self._replace(**parts)
 
 
 class NearFacets:

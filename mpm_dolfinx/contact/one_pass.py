@@ -18,7 +18,7 @@ from .outcome import Outcome
 from .pair_matrices import Met, Places
 from .surface import Surface
 
-__all__ = ["Evaluation", "Pass"]
+__all__ = ["Evaluation", "Pass", "State"]
 
 type Array = NDArray[np.float64]
 
@@ -45,7 +45,19 @@ class Evaluation(Protocol):
         """
 
 
-class Pass[State, Found: Evaluation]:
+class State(Protocol):
+    """Points at a converged step."""
+
+    @property
+    def outcome(self) -> Outcome:
+        """What acted on them."""
+
+    @property
+    def friction(self) -> Array:
+        """What the law of friction remembers, the last of its dimensions for each point."""
+
+
+class Pass[Past: State, Found: Evaluation]:
     """Points of a body's surface against a target, on meshes that stay the same.
 
     Args:
@@ -65,7 +77,7 @@ class Pass[State, Found: Evaluation]:
     #: What is said of points that are deep in the target from the beginning.
     WITHIN: str
 
-    state: State
+    state: Past
     _stiffness: Array
     _normal: Array
 
@@ -119,7 +131,7 @@ class Pass[State, Found: Evaluation]:
     @property
     def told(self) -> Outcome:
         """Outcome at the last converged step."""
-        raise NotImplementedError
+        return self.state.outcome
 
     @property
     def gap(self) -> Array:
@@ -134,7 +146,7 @@ class Pass[State, Found: Evaluation]:
     @property
     def rubbed(self) -> Array:
         """Memory of the law of friction, shape ``(n, k)``."""
-        raise NotImplementedError
+        return self.state.friction.reshape(self.told.gap.size, len(self._law.memory))
 
     def touches(self) -> bool:
         """Return whether any point of this rank touches, or has (not collective)."""
@@ -174,7 +186,7 @@ class Pass[State, Found: Evaluation]:
         """
         raise NotImplementedError
 
-    def after(self) -> State:
+    def after(self) -> Past:
         """Return the state after the last evaluation.
 
         Raises:

@@ -21,11 +21,7 @@ def facet_normals(corners: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Those without a size have zero.
     """
-    if corners.shape[-1] == 2:
-        way = corners[:, 1] - corners[:, 0]
-        n = np.column_stack([way[:, 1], -way[:, 0]])
-    else:
-        n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    n = area_vectors(corners)
     size = np.linalg.norm(n, axis=1)[:, None]
     return np.asarray(n / np.where(size > 0.0, size, 1.0))
 

@@ -70,6 +70,9 @@ class RigidMotion:
         still: How it begins.
 
     Attributes:
+        mass: As given; 0 if it has none.
+        inertia: As given; zero if it has none.
+        gravity: As given.
         held: As given.
         start: As given.
         last: State at the last converged step.
@@ -90,11 +93,11 @@ class RigidMotion:
         held: NDArray[np.bool_],
         still: State,
     ) -> None:
-        self.held, self.start, self._gravity = held, start, gravity
+        self.held, self.start, self.gravity = held, start, gravity
         self._gdim = len(start)
-        self._m = 0.0 if mass is None else mass
+        self.mass = 0.0 if mass is None else mass
         nr = len(held) - self._gdim
-        self._J = np.zeros((nr, nr)) if inertia is None else inertia
+        self.inertia = np.zeros((nr, nr)) if inertia is None else inertia
         self.last = self.trial = still
         self.step = np.zeros(len(held))
         self.push = still.force, still.moment
@@ -105,35 +108,8 @@ class RigidMotion:
     @property
     def gyration(self) -> float | None:
         """Radius of gyration, where it has a mass and an inertia."""
-        mean = float(np.trace(self._J)) / len(self._J)
-        return float(np.sqrt(mean / self._m)) if self._m > 0.0 and mean > 0.0 else None
-
-    # -- What it has at the last converged step ---------------------------------------------------
-
-    @property
-    def kinetic_energy(self) -> float:
-        """Its kinetic energy."""
-        state = self.last
-        turning = 0.5 * float(state.spin @ self._J @ state.spin)
-        return 0.5 * self._m * float(state.velocity @ state.velocity) + turning
-
-    @property
-    def potential_energy(self) -> float:
-        """Its energy in the field of gravity, zero at the beginning."""
-        return -self._m * float(self._gravity @ self.last.place)
-
-    @property
-    def momentum(self) -> NDArray[np.float64]:
-        """Its momentum, shape ``(gdim,)``."""
-        return self._m * self.last.velocity
-
-    @property
-    def angular_momentum(self) -> NDArray[np.float64]:
-        """Its angular momentum about the origin, ``(1,)`` or ``(3,)``."""
-        turning = self._J @ self.last.spin
-        if len(turning) == 3:
-            turning = self.last.Q @ turning
-        return np.asarray(turning + crossing(self.centres[0]).T @ self.momentum)
+        mean = float(np.trace(self.inertia)) / len(self.inertia)
+        return float(np.sqrt(mean / self.mass)) if self.mass > 0.0 and mean > 0.0 else None
 
     # -- A step ---------------------------------------------------------------------------------
 
@@ -190,17 +166,17 @@ class RigidMotion:
         if self.whole:
             force = 0.5 * (force + self.last.force)
             moment = 0.5 * (moment + self.last.moment)
-        return np.concatenate([force + self._m * self._gravity, moment])
+        return np.concatenate([force + self.mass * self.gravity, moment])
 
     def inertial(self) -> NDArray[np.float64]:
         """Return the forces of inertia over the step."""
         last, state = self.last, self.trial
         if self.dt is None:
             return np.zeros(len(self.held))
-        before, after = (self._J @ s.spin for s in (last, state))
+        before, after = (self.inertia @ s.spin for s in (last, state))
         if len(before) == 3:
             before, after = last.Q @ before, state.Q @ after
-        linear = self._m * (state.velocity - last.velocity)
+        linear = self.mass * (state.velocity - last.velocity)
         return np.concatenate([linear, after - before]) / self.dt
 
     def slopes(self) -> NDArray[np.float64]:
@@ -211,11 +187,11 @@ class RigidMotion:
         if self.dt is None:
             return K
         c = 2.0 if self.whole else 1.0
-        K[:gdim, :gdim] = c * self._m / self.dt**2 * np.eye(gdim)
+        K[:gdim, :gdim] = c * self.mass / self.dt**2 * np.eye(gdim)
         if nr == 1:
-            K[gdim:, gdim:] = c * self._J / self.dt**2
+            K[gdim:, gdim:] = c * self.inertia / self.dt**2
             return K
-        Q, J = state.Q, self._J
+        Q, J = state.Q, self.inertia
         K[gdim:, gdim:] = crossing(Q @ J @ state.spin) @ cayley_variation(theta) / self.dt
         K[gdim:, gdim:] += c * Q @ J @ self.last.Q.T / self.dt**2
         return K
@@ -224,7 +200,7 @@ class RigidMotion:
         """Return the size of the forces of inertia that would stop it within a step."""
         if self.dt is None:
             return 0.0
-        return 2.0 / self.dt * self._m * float(np.linalg.norm(self.last.velocity))
+        return 2.0 / self.dt * self.mass * float(np.linalg.norm(self.last.velocity))
 
     # -- What is kept ---------------------------------------------------------------------------
 

@@ -270,11 +270,6 @@ class ShapePass(Pass[ShapeMemory, Touch]):
 
     @property
     @override
-    def told(self) -> Outcome:
-        return self.state.outcome
-
-    @property
-    @override
     def gap(self) -> Array:
         if not self.state.exact:
             self.state = self._exact(self.state)
@@ -289,12 +284,6 @@ class ShapePass(Pass[ShapeMemory, Touch]):
     @override
     def anchors(self) -> Array:
         return unframed(self._shape, self.state.pose, self.state.anchor)
-
-    @property
-    @override
-    def rubbed(self) -> Array:
-        friction = self.state.friction
-        return friction.reshape(self.state.gap.size, friction.shape[2])
 
     def _exact(self, memory: ShapeMemory, which: NDArray[np.int64] | None = None) -> ShapeMemory:
         """Return the memory with the gaps of all points of some facets, or of all facets."""

@@ -55,36 +55,45 @@ class _Place(NamedTuple):
     off: NDArray[np.bool_]
 
 
-class _Solid(NamedTuple):
-    """A solid by its facets.
-
-    Attributes:
-        points: Corners, shape ``(n, dim)``.
-        facets: Corners of each facet, oriented outwards, shape ``(m, dim)``.
-        radius: How far they lie within the surface, whose edges are rounded.
-        outline: Corners of the surface itself.
-    """
-
-    points: NDArray[np.float64]
-    facets: NDArray[np.int64]
-    radius: float
-    outline: NDArray[np.float64]
-
-
 class _Faceted(Shape):
-    """Solid behind segments or triangles, which are oriented outwards, with rounded edges.
+    """Solid behind segments or triangles, with rounded edges.
 
     Args:
-        solid: The facets.
-        pivot: The point about which it turns.
+        x: Corners of the surface, shape ``(n, dim)``.
+        facets: Corners of each facet, shape ``(m, dim)``.
+        outside: A direction that points to the free side of an open surface.
+        radius: Of edges and corners.
+        pivot: The point about which it turns; ``None``: the middle of the box around it.
+        what: The surface, in a sentence.
+
+    Attributes:
+        points: Corners of the facets, which lie within the surface by the radius.
+        facets: Corners of each, oriented outwards.
+
+    Raises:
+        MPMError: They make no surface, or one that is too small for the radius.
     """
 
     costly = True
 
-    def __init__(self, solid: _Solid, pivot: NDArray[np.float64]) -> None:
-        points, facets, self._radius, self._outline = solid
-        super().__init__(points.shape[1], pivot)
-        self.points, self.facets = points, facets
+    def __init__(
+        self,
+        x: NDArray[np.float64],
+        facets: NDArray[np.int64],
+        outside: Any,
+        radius: float,
+        pivot: Any,
+        what: str = "The surface",
+    ) -> None:
+        self._radius = as_radius(radius)
+        self._outline, facets = _merged(x, facets)
+        if len(facets) == 0:
+            raise MPMError(f"{what} has no extent: all of its corners are at one place.")
+        facets = self.facets = oriented(self._outline, facets, outside, what)
+        points = self.points = _inner(self._outline, facets, self._radius, what)
+        dim = x.shape[1]
+        middle = self.bounds.mean(axis=0) if pivot is None else as_point(pivot, "pivot", dim)
+        super().__init__(dim, middle)
         self._on = ROUND_OFF * float(np.abs(points).max(initial=0.0))
         corners = points[facets]
         self._normals = facet_normals(corners)
@@ -213,7 +222,7 @@ def triangulated(
             too large.
     """
     x, facets = _as_arrays(points, triangles, 3, "triangulated")
-    return _surface(x, facets, outside, radius, pivot)
+    return _Faceted(x, facets, outside, radius, pivot)
 
 
 def polygon(corners: Any, radius: float = 0.0) -> Shape:
@@ -233,8 +242,9 @@ def polygon(corners: Any, radius: float = 0.0) -> Shape:
         raise MPMError(f"A polygon needs three corners (x, y) or more, not {corners!r}.")
     count = np.arange(len(given))
     edges = np.column_stack([count, np.roll(count, -1)])
-    solid = _solid(given, edges, None, as_radius(radius), "The polygon")
-    return _Faceted(solid, solid.points.mean(axis=0))
+    shape = _Faceted(given, edges, None, radius, None, "The polygon")
+    shape.pivot = shape.points.mean(axis=0)
+    return shape
 
 
 def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: Any = None) -> Shape:
@@ -257,7 +267,7 @@ def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: An
         number = 0
     count = np.arange(number)
     x, facets = _as_arrays(points, np.column_stack([count[:-1], count[1:]]), 2, "polyline")
-    return _surface(x, facets, outside, radius, pivot)
+    return _Faceted(x, facets, outside, radius, pivot)
 
 
 def terrain(x: Any, y: Any, heights: Any, *, radius: float = 0.0, pivot: Any = None) -> Shape:
@@ -286,7 +296,7 @@ def terrain(x: Any, y: Any, heights: Any, *, radius: float = 0.0, pivot: Any = N
     number = np.arange(z.size).reshape(z.shape)
     a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
     cells = [np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))]
-    return _surface(points, np.concatenate(cells), (0.0, 0.0, 1.0), radius, pivot)
+    return _Faceted(points, np.concatenate(cells), (0.0, 0.0, 1.0), radius, pivot)
 
 
 def read_surface(
@@ -325,7 +335,8 @@ def read_surface(
             found = _read(Path(path))
     found = comm.bcast(found)
     assert found is not None
-    return _surface(factor * found[0], found[1], outside, radius, pivot, str(path))
+    points, triangles = found
+    return _Faceted(factor * points, triangles, outside, radius, pivot, f"The surface of {path}")
 
 
 def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -353,6 +364,8 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         raise MPMError(f"There are no triangles in {path}.")
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise MPMError(f"Triangles of {path} have points that are not there.")
+    if not np.isfinite(points).all():
+        raise MPMError(f"The surface of {path} has points that are not finite.")
     return points, triangles
 
 
@@ -377,39 +390,6 @@ def _as_arrays(
 def _told(value: Any) -> str:
     shape = getattr(value, "shape", None)
     return f"{value!r:.80}" if shape is None else f"an array of the shape {shape}"
-
-
-def _surface(
-    x: NDArray[np.float64],
-    facets: NDArray[np.int64],
-    outside: Any,
-    radius: float,
-    pivot: Any,
-    name: str | None = None,
-) -> Shape:
-    """Return the shape of facets that are looked at."""
-    what = "The surface" if name is None else f"The surface of {name}"
-    if len(x) and not np.isfinite(x).all():
-        raise MPMError(f"{what} has points that are not finite.")
-    solid = _solid(x, facets, outside, as_radius(radius), what)
-    ends = np.array([solid.outline.min(axis=0), solid.outline.max(axis=0)])
-    centre = ends.mean(axis=0) if pivot is None else as_point(pivot, "pivot", x.shape[1])
-    return _Faceted(solid, centre)
-
-
-def _solid(
-    x: NDArray[np.float64], facets: NDArray[np.int64], outside: Any, radius: float, what: str
-) -> _Solid:
-    """Return facets with their corners moved inwards by a radius.
-
-    Raises:
-        MPMError: They make no surface, or one that is too small for the radius.
-    """
-    x, facets = _merged(x, facets)
-    if len(facets) == 0:
-        raise MPMError(f"{what} has no extent: all of its corners are at one place.")
-    facets = oriented(x, facets, outside, what)
-    return _Solid(_inner(x, facets, radius, what) if radius > 0.0 else x, facets, radius, x)
 
 
 def _merged(
@@ -440,6 +420,8 @@ def _inner(
     its facets.
     """
     dim = x.shape[1]
+    if radius == 0.0:
+        return x
     n = facet_normals(x[facets])
     A, b = np.zeros((len(x), dim, dim)), np.zeros((len(x), dim))
     for k in range(dim):
