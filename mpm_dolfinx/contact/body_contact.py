@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, override
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -22,7 +21,7 @@ from .rigid import Rigid
 from .rotation import Pose, cayley_variation, crossing
 from .shape_pass import Touch
 from .shapes import Shape
-from .surface import Blocks, PointMatrix, global_dofs
+from .surface import Blocks, Layout, PointMatrix, global_dofs
 
 __all__ = ["BodyContact", "Coupled"]
 
@@ -115,17 +114,9 @@ class BodyContact(Rigid):
         return float((self._pass.source.weights * self._pass.penalties).sum())
 
     @property
-    def extent(self) -> float:
-        """Largest coordinate of the undeformed body."""
-        return self._pass.source.layout.extent
-
-    def span(self) -> float:
-        """Return the largest length of the undeformed body along an axis (collective)."""
-        x = self.bodies[0].initial_domains.reshape(-1, self.shape.dim)
-        ends = np.concatenate([x.max(axis=0, initial=-np.inf), (-x).max(axis=0, initial=-np.inf)])
-        self.bodies[0].mesh.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
-        above, below = np.split(ends, 2)
-        return float((above + below).max())
+    def layout(self) -> Layout:
+        """The facets of the body that deforms."""
+        return self._pass.source.layout
 
     def total(self, centres: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
         """Return this rank's force and moment on the other body.

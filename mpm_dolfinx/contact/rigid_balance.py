@@ -87,7 +87,7 @@ class RigidBalance:
         """Take the bodies as they are, at rest (collective)."""
         self.share, motion = 1.0, self._motion
         motion.dt, motion.whole = None, False
-        self._span = max([contact.span() for contact in self._contacts])
+        self._span = max([contact.layout.span for contact in self._contacts])
         length = self._span if motion.gyration is None else motion.gyration
         turns = np.arange(len(motion.held)) >= len(motion.start)
         self._units = np.diag(np.where(turns, 1.0 / length, 1.0))
@@ -266,7 +266,7 @@ class RigidBalance:
         way = -self._each @ now.left
         way[len(self._motion.start) :] = 0.0
         size = float(np.linalg.norm(way))
-        extent = max(contact.extent for contact in self._contacts)
+        extent = max(contact.layout.extent for contact in self._contacts)
         # (where it falls to: into what it falls on, by more than round-off of coordinates)
         close = HALF_DIGITS * self._span + LAST_PLACES * extent
         gap, gone = self._least_gap(step), 0.0

@@ -24,7 +24,7 @@ from ..errors import MPMError
 from ..meshes.remesh import Column
 from ..parallel.given import require_truth
 from ..particles.particles import Particles
-from ..tolerances import ROUND_OFF
+from ..tolerances import LAST_PLACES, ROUND_OFF
 
 __all__ = [
     "Blocks",
@@ -125,6 +125,7 @@ class Layout:
         narrowing: The dimension where the domain behind narrows to a point, as triangles, halves of
             quadrilaterals and tetrahedra do, elsewhere 1, shape ``(m,)``.
         extent: Largest coordinate of the undeformed body.
+        span: Its largest length along an axis.
         distinct: The nodes of all facets, each once, shape ``(n,)``.
         positions: Where they are in the mesh, shape ``(n, gdim)``.
         around: Length of the way around the axis of a body of revolution, elsewhere 1.
@@ -137,6 +138,7 @@ class Layout:
     outward: NDArray[np.float64]
     narrowing: NDArray[np.int64]
     extent: float
+    span: float
     distinct: NDArray[np.int64]
     positions: NDArray[np.float64]
     around: NDArray[np.float64]
@@ -244,7 +246,9 @@ class Surface:
         own = self.particles
         halves = own.trail.halves(own.global_index, own.num_global)
         narrows = (body.basix_cell() in SIMPLICES) | halves[cells]
-        extent = float(np.abs(self.particles.initial_domains).max(initial=0.0))
+        corners = self.particles.initial_domains.reshape(-1, self.gdim)
+        ends = np.array([f.max(axis=0, initial=-np.inf) for f in (corners, -corners)])
+        body.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
         around = np.ones_like(self._areas)
         if self.axisymmetric:
             around = 2.0 * np.pi * (self.shapes @ X[nodes])[:, :, 0]
@@ -255,7 +259,8 @@ class Surface:
             places.reshape(nodes.shape),
             np.where(((centre - middle) * n).sum(axis=1) < 0.0, -1.0, 1.0),
             np.where(narrows, self.gdim, 1),
-            float(body.comm.allreduce(extent, MPI.MAX)),
+            float(ends.max()),
+            float(ends.sum(axis=0).max()),
             distinct,
             x[distinct],
             around,
@@ -279,8 +284,8 @@ class Surface:
 
     @property
     def touch(self) -> float:
-        """Gap at which points touch."""
-        return ROUND_OFF * self.layout.extent
+        """Gap at which points touch: round-off of displacements and of coordinates."""
+        return ROUND_OFF * self.layout.span + LAST_PLACES * self.layout.extent
 
     @property
     def mesh_area_ratio(self) -> NDArray[np.float64]:

@@ -446,18 +446,15 @@ def creeping(frame):
     return scene
 
 
-def beside(frame):
-    """A block in equilibrium on which another one, which is thrown, slides.
-
-    (Contact that keeps energy divides gaps by strains: 2e-5 in a map's coordinates.)
-    """
+def beside(frame, scheme):
+    """A block in equilibrium on which another one, which is thrown, slides."""
     scene, f = Scene(frame), frame
     below = scene.body(scene.background(0.0, 2.0), size=(2.2, 1.0))
     above = scene.body(scene.background(0.5, 3.0, held=False), 1.0, size=(1.5, 0.9))
     scene.terms.append(contact.Pair(below, above, friction=0.4))
     start = np.array(f.vector(0.0, -2.0)) * f.length / f.time
     velocity = [None, tuple(start)][:: -1 if f.swap else 1]
-    options = {"velocity": velocity, "quasi_static": [below], "scheme": "euler"}
+    options = {"velocity": velocity, "quasi_static": [below], "scheme": scheme}
     problem = scene.problem(mpm.DynamicProblem, **options)
     problem.solve(time=0.08 * f.time, dt=0.02 * f.time)
     return scene
@@ -745,7 +742,8 @@ SCENES = {
     "adaptivity, soil": of(adapted, "mohr coulomb"),
     "free nodes, soil": of(free, "some", law="mohr coulomb"),
     "relaxation, dashpots": creeping,
-    "quasi_static": beside,
+    "quasi-static beside, euler": of(beside, "euler"),
+    "quasi-static beside, midpoint": of(beside, "midpoint"),
     "RigidBody at rest": resting,
     "Sensitivity": derived,
     "Adjoint": of(derived, True),
@@ -772,6 +770,7 @@ QUICK = (
     "mohr coulomb",
     "a floor",
     "adaptivity",
+    "quasi-static beside, midpoint",
 )
 
 
