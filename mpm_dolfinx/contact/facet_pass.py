@@ -24,12 +24,10 @@ from .one_pass import Pass, retold, worn
 from .outcome import Outcome, untouched
 from .pair_matrices import Places
 from .stencil import Start, Stencil, acting
-from .surface import Surface
+from .surface import NEAR, Surface
 
 __all__ = ["FacetPass"]
 
-#: How near surfaces are looked for, in facets' sizes.
-REACH = 2.0
 #: Residuals of an attempt after which points stay with their facets.
 FREEZE = 12
 
@@ -86,7 +84,7 @@ class FacetPass(Pass[Past, Meeting]):
         self.share = share
         self._target = target
         self._stiffness = self._normal = self._in_series(*stiffnesses)
-        reach = REACH * max(surface.size for surface in (source, target))
+        reach = NEAR * max(surface.size for surface in (source, target))
         body = target.particles
         facets = len(basix.topology(body.mesh.basix_cell())[target.gdim - 1])
         number = body.global_index[target.layout.cells] * facets + target.layout.facets

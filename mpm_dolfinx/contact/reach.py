@@ -17,12 +17,9 @@ from numpy.typing import NDArray
 from .memory import ShapeMemory
 from .rotation import Pose
 from .shapes import Shape
-from .surface import Surface
+from .surface import NEAR, Surface
 
 __all__ = ["Reach", "is_near"]
-
-#: Gap, over the thickness of the domain behind, up to which a facet may touch in a step.
-NEAR = 2.0
 
 
 class Near(NamedTuple):

@@ -20,15 +20,13 @@ from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..system.own import OwnUnknowns
-from ..tolerances import HALF_DIGITS, LAST_PLACES, LOCAL_ITERATIONS
+from ..tolerances import HALF_DIGITS, LAST_PLACES, LOCAL_ITERATIONS, NEGLIGIBLE
 from .body_contact import BodyContact
 from .rigid_motion import RigidMotion, State
 from .rotation import QUARTER, Pose
 
 __all__ = ["RigidBalance"]
 
-#: Stiffness, relative to the largest, below which nothing holds a body.
-LOOSE = 1e-11
 #: Share of its forces that nothing bears above which a body at rest is brought nearer to balance
 #: before a step.
 UNBALANCED = 0.1
@@ -210,7 +208,7 @@ class RigidBalance:
         """
         U, sizes, V = np.linalg.svd(K)
         most = largest or self._stiffness
-        return np.asarray(U * np.where(sizes > LOOSE * most, sizes, most) @ V)
+        return np.asarray(U * np.where(sizes > NEGLIGIBLE * most, sizes, most) @ V)
 
     # -- Where it begins at rest ------------------------------------------------------------------
 
@@ -234,7 +232,7 @@ class RigidBalance:
             with agree(self._comm):  # of the slopes of a user's shape
                 parts = [contact.of_own(motion.centres, motion.theta) for contact in self._contacts]
             K, largest = self._whole(np.sum(parts, axis=0))
-            if not now.touches or np.linalg.norm(K, 2) <= LOOSE * largest:
+            if not now.touches or np.linalg.norm(K, 2) <= NEGLIGIBLE * largest:
                 step = self._fallen(step, now)
                 now = self._tried(step)
                 continue

@@ -27,6 +27,7 @@ from ..particles.particles import Particles
 from ..tolerances import LAST_PLACES, ROUND_OFF
 
 __all__ = [
+    "NEAR",
     "Blocks",
     "Facets",
     "Layout",
@@ -40,6 +41,10 @@ __all__ = [
 ]
 
 
+#: How near what points may touch is looked for in a step, over the size of facets or the height of
+#: the domains behind: farther than any goes in a step that converges; where one does, all is looked
+#: at again.
+NEAR = 2.0
 #: Cells that narrow to a point over each of their facets.
 SIMPLICES = (basix.CellType.triangle, basix.CellType.tetrahedron)
 
