@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 import ufl
 
-from ..errors import MPMError
 from ..meshes.quadrature import nodal_forces
 from ..particles.domains import behind_axis
-from ..particles.particles import Particles
+from ..particles.particles import Particles, require_at_nodes
 
 __all__ = ["Revolution", "Strain", "strain_of"]
 
@@ -131,12 +130,7 @@ class Revolution(Strain):
         super().__init__(particles)
         undeformed = particles.undeformed
         undeformed.require_radius()
-        if not particles.mover.method.at_nodes:
-            raise MPMError(
-                f"A body of revolution needs method='cpdi2' or 'cpdi': the weights of "
-                f"{particles.method!r} are means in the plane, and stresses at the axis would be "
-                "wrong on any grid."
-            )
+        require_at_nodes("A body of revolution", particles)
         undeformed.revolve(True)
         self.dim = 3
         self._mesh_radius = ufl.SpatialCoordinate(particles.mesh)[0]

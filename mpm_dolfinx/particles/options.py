@@ -31,6 +31,7 @@ from ..transfer.methods import METHODS
 
 __all__ = [
     "Coordinates",
+    "not_divisible",
     "validate_cells",
     "validate_distortion",
     "validate_options",
@@ -209,7 +210,7 @@ def validate_free(V: fem.FunctionSpace | None, method: str, on_distortion: str) 
     if method != "cpdi2":
         raise MPMError(f"Free nodes are shared by neighbours; use method='cpdi2', not {method!r}.")
     if on_distortion != "error":
-        raise MPMError("Domains with free nodes cannot be split; omit on_distortion=.")
+        raise not_divisible()
 
 
 def validate_distortion(
@@ -221,10 +222,16 @@ def validate_distortion(
     plain = (body.basix_cell(), _compat.geometry_degree(body)) == (BOX_CELLS[0], 1)
     one_point = plain and (method, degree) == ("cpdi2", 1) and quadrature_degree in (None, 0, 1)
     if policy == "split" and not one_point:
-        raise MPMError(
-            "Only quadrilaterals with one quadrature point and method 'cpdi2' can be split "
-            "(on_distortion='split'); others fold less with quadrature_degree=2 and f_bar='domain'."
-        )
+        raise not_divisible()
+
+
+def not_divisible() -> MPMError:
+    """Return the error that says which domains can be split."""
+    return MPMError(
+        "Only quadrilaterals in the plane with one quadrature point, method 'cpdi2' and no free "
+        "nodes can be split, where no f_bar= or length= averages over several (on_distortion="
+        "'split'); others fold less with quadrature_degree=2 and f_bar='domain'."
+    )
 
 
 def validate_cells(domain: mesh.Mesh, what: str) -> None:

@@ -44,7 +44,7 @@ from .reference import Reference
 from .response import MaterialDomains
 from .undeformed import Undeformed
 
-__all__ = ["LoadFactor", "Particles", "require_shared_nodes"]
+__all__ = ["LoadFactor", "Particles", "require_at_nodes", "require_shared_nodes"]
 
 
 class LoadFactor(fem.Constant):
@@ -535,6 +535,20 @@ def require_shared_nodes(what: str, body: Any) -> None:
         raise MPMError(
             f"{what} needs mpm.Particles whose domains share their nodes: of method='cpdi2', made "
             "of one mesh, or finite elements."
+        )
+
+
+def require_at_nodes(what: str, body: Particles) -> None:
+    """Raise an error where a body's domains are not moved at their nodes.
+
+    Args:
+        what: What needs it.
+        body: The body.
+    """
+    if not body.mover.method.at_nodes:
+        raise MPMError(
+            f"{what} needs method='cpdi2' or 'cpdi', whose domains move at their nodes, not "
+            f"{body.method!r}."
         )
 
 

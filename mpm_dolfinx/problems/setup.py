@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from ..boundary.supports import Support
 from ..errors import MPMError
 from ..parallel.given import require_truth
+from ..particles.options import not_divisible
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from ..system.term import Term
@@ -145,19 +146,6 @@ class Setup:
         """
         self.require_movable("domains cannot be split")
         self.require_remeshable("domains cannot be split")
-        for body in self.bodies:
-            if body.f_bar != "none":
-                raise MPMError(
-                    f"Domains cannot be split with f_bar={body.f_bar!r}, whose averages they would "
-                    "change; it keeps most domains from folding by itself."
-                )
-            if body.length is not None:
-                raise MPMError(
-                    "Domains cannot be split in a body with a length=, which averages over the "
-                    "undeformed body; omit one of them."
-                )
-        if self.axisymmetric:
-            raise MPMError(
-                "Domains of a body of revolution cannot be split, since the halves have other "
-                "radii; use quadrature_degree=2 with f_bar='domain'."
-            )
+        averaged = any(body.f_bar != "none" or body.length is not None for body in self.bodies)
+        if averaged or self.axisymmetric:
+            raise not_divisible()

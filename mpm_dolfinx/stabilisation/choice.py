@@ -6,8 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..errors import MPMError
-from ..particles.particles import Particles
+from ..particles.particles import Particles, require_at_nodes
 from .ghost_penalty import GhostPenalty
 from .joints import Joints
 
@@ -47,10 +46,7 @@ def stabilisation_of(
         if not body.mover.method.at_nodes:
             if least > 0.0:
                 return None
-            raise MPMError(
-                f"stabilisation={kind!r} is for the methods 'cpdi2' and 'cpdi', not for "
-                f"{body.method!r}; use stabilisation=None."
-            )
+            require_at_nodes(f"stabilisation={kind!r}", body)
     return GhostPenalty(bodies, least)
 
 
