@@ -18,11 +18,13 @@ from ..tolerances import ARMIJO
 
 __all__ = ["LineSearch", "Rules", "stalled"]
 
-#: Most halvings of a Newton step.
+#: Most halvings of a Newton step, and the share of its start that the work may keep without any:
+#: with 0.5 and less, as where points yield, a body that gives way finds its way less far.
 HALVINGS = 8
-#: Share of its start that the work may keep: 0.4 and 0.6 take up to 2 and 16 % more solves.
-SUFFICIENT = 0.3
-#: Most evaluations that look for such a step where points yield.
+SUFFICIENT = 0.8
+#: Share of its start that the work may keep where points yield, and most evaluations that look
+#: for such a step.
+SHARP = 0.3
 SECANTS = 4
 #: Growth of the norm up to which a step goes on over a fold.
 FOLD = 10.0
@@ -83,7 +85,7 @@ class Rules(NamedTuple):
 class LineSearch:
     """Shortens a Newton step, in another direction where its own leads uphill.
 
-    A step is taken where the residual's work on it falls to 0.3 of its start in absolute value,
+    A step is taken where the residual's work on it falls to 0.8 of its start in absolute value,
     or the residual's norm falls. Where the whole step does neither and the tangent is not
     positive definite, its direction may be one in which the incremental potential grows; the
     direction is then that of a damped tangent which is (a modified Newton step: Nocedal &
@@ -232,7 +234,7 @@ class LineSearch:
             Whether the step has changed.
         """
         work = F.dot(step.direction)
-        far = abs(work) > SUFFICIENT * abs(step.work)
+        far = abs(work) > SHARP * abs(step.work)
         if not (self._rules.works and far and step.work > 0.0) or step.reversed:
             return False
         if self._trusted is not None or self._smooth():
@@ -257,7 +259,7 @@ class LineSearch:
             work = -step.work if failed else F.dot(step.direction)
             if not failed and abs(work) < found[0]:
                 found = abs(work), share
-            if not failed and abs(work) <= SUFFICIENT * step.work:
+            if not failed and abs(work) <= SHARP * step.work:
                 break
         if share != found[1]:
             trial.waxpy(-found[1], step.y, step.x)

@@ -47,7 +47,7 @@ class NewtonSolver:
     negative pivots as there are of them.
 
     The line search halves a Newton step while a domain inverts, or while both the work of the
-    residual on the step stays above 0.3 of its start and the residual's norm grows, unless the
+    residual on the step stays above 0.8 of its start and the residual's norm grows, unless the
     response is smooth and the next steps make up for it.
 
     Args:
