@@ -481,13 +481,13 @@ def test_refused():
     with pytest.raises(mpm.MPMError, match="particle 3 cannot be split"):
         problem.split([3])
     problem = scenes.block()
-    with pytest.raises(mpm.MPMError, match="Only quadrilaterals with one quadrature point"):
+    with pytest.raises(mpm.MPMError, match="Only quadrilaterals in the plane with one quadrature"):
         problem.split([0])
     V, body = problem.particles.V, scenes.unit(4, QUADRILATERAL)
     particles = mpm.Particles(body, V, on_distortion="split")
     for options, reason in (
-        ({"f_bar": "patch"}, "with f_bar='patch'"),
-        ({"axisymmetric": True}, "body of revolution"),
+        ({"f_bar": "patch"}, "where no f_bar= or length= averages"),
+        ({"axisymmetric": True}, "Only quadrilaterals in the plane"),
         ({"body_force": ufl.SpatialCoordinate(body)}, "so domains cannot be split"),
     ):
         with pytest.raises(mpm.MPMError, match=reason):
