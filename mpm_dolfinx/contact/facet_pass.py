@@ -48,7 +48,7 @@ class Past(NamedTuple):
 
     @property
     def friction(self) -> Array:
-        """What the law of friction remembers, shape ``(n, k)``."""
+        """Memory of the law of friction, shape ``(n, k)``."""
         return self.memory.friction
 
 

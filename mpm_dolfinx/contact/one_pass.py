@@ -50,11 +50,11 @@ class State(Protocol):
 
     @property
     def outcome(self) -> Outcome:
-        """What acted on them."""
+        """Tractions that acted on them."""
 
     @property
     def friction(self) -> Array:
-        """What the law of friction remembers, the last of its dimensions for each point."""
+        """Memory of the law of friction, the last of its dimensions for each point."""
 
 
 class Pass[Past: State, Found: Evaluation]:

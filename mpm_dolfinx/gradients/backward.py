@@ -264,7 +264,7 @@ class Backward:
 
 
 def copied(memories: Sequence[Sequence[State]]) -> list[list[State]]:
-    """Return what materials of bodies keep, as arrays that nobody else changes."""
+    """Return the states of the bodies' materials, as arrays that nobody else changes."""
     return [[{name: v.copy() for name, v in own.items()} for own in body] for body in memories]
 
 
