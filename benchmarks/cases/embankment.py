@@ -5,8 +5,9 @@
 Half of a bank 2 m high, 4 m wide from its axis to its shoulder and with slopes of 1:2, on 6 m of
 clay with an undrained strength of 15 kPa that carries its own weight. The fill is placed in lifts,
 each in three steps, and after the last one the strength of all soil is reduced until no equilibrium
-is found. `built` says whether all lifts stand, `factor` is the factor of safety, and `reason` why
-the reduction ended. All by defaults, with averages over patches.
+is found. `built` says whether all lifts stand, `factor` is the factor of safety, `reason` why the
+reduction ended, and `curve` has factors and displacements. All by defaults, with averages over
+patches.
 """
 
 from itertools import pairwise
@@ -82,7 +83,7 @@ problem = mpm.QuasiStaticProblem(
     solver=mpm.Solver(petsc_options_prefix="embankment_"),
 )
 
-failure, factor, reason, standing, most = None, np.nan, None, 0, 0
+failure, factor, reason, standing, most, curve = None, np.nan, None, 0, 0, []
 try:
     problem.solve()
     levels = depth + height * np.arange(args.lifts + 1) / args.lifts
@@ -94,7 +95,7 @@ try:
             most = max(most, step.iterations)
         standing = number
     found = mpm.strength_reduction(problem, tolerance=args.tolerance, displacement=args.limit)
-    factor, reason = found.factor, found.reason
+    factor, reason, curve = found.factor, found.reason, found.curve.tolist()
 except mpm.MPMError as error:
     failure = error
 
@@ -104,6 +105,7 @@ numbers = {
     "factor": factor,
     "reason": reason,
     "most_solves": most,
+    "curve": curve,
 }
 rows = [
     ("lifts that stand", f"{standing} of {args.lifts}"),

@@ -7,6 +7,11 @@ the cut has laid bare; a mesh that is held together on the axis would cover that
 facet alone. So for a wedge the clay is parted there: it leans on a smooth wall, and the tip goes
 down between the two. The wedge's `ratio` is the force over the depth, which is the same at all
 depths, in the last half of the path, over the exact one.
+
+A footing that goes deep is that of Kardani, Nazem, Carter & Abbo (2015), 1 m wide on weightless
+clay of 10 by 5 m: `--obstacle footing --depth 1 --young 100 --poisson 0.495 --wide 5 --deep 5`.
+Clay that passes its edge is drawn out, and as facets are straight, long ones would make it wider:
+`--edge 8`. `curve` has depths and forces over c and 1 m.
 """
 
 import kit
@@ -24,6 +29,9 @@ parser.add_argument("--angle", type=kit.positive, default=45.0, help="half angle
 parser.add_argument("--cell", type=kit.positive, default=0.125, help="background cell size")
 parser.add_argument("--domain", choices=("quad", "tri"), default="quad", help="particle domains")
 parser.add_argument("--young", type=kit.positive, default=500.0, help="modulus over cohesion")
+parser.add_argument("--poisson", type=float, default=0.45, help="Poisson's ratio")
+parser.add_argument("--wide", type=kit.positive, default=4.0, help="half width of the soil, m")
+parser.add_argument("--deep", type=kit.positive, default=2.5, help="its depth, m")
 parser.add_argument("--radius", type=kit.positive, help="of corners: 0.05, 0.01 of the footing")
 parser.add_argument("--law", choices=("penalty", "nitsche"), default="penalty", help="of contact")
 parser.add_argument("--penalty", type=kit.positive, default=1.0, help="of the contact")
@@ -38,12 +46,15 @@ parser.add_argument("--domains-per-cell", type=kit.whole, default=2, help="each 
 parser.add_argument(
     "--finer", type=kit.count, default=0, help="how often cells are halved towards the edge at 0.5"
 )
+parser.add_argument(
+    "--edge", type=kit.whole, default=1, help="domains are so much narrower where they pass an edge"
+)
 args = parser.parse()
 
-# The right half of a soil 8 m wide and 2.5 m deep; obstacles are 1 m wide but for the wedge.
+# The right half of the soil; obstacles are 1 m wide but for the wedge.
 
-wide, deep, h = 4.0, 2.5, args.cell
-young, poisson, cohesion = args.young, 0.45, 1.0
+wide, deep, h = args.wide, args.deep, args.cell
+young, poisson, cohesion = args.young, args.poisson, 1.0
 depth = args.depth or (0.03 if args.obstacle == "footing" else 0.6)
 steps = args.steps or (20 if args.obstacle == "footing" else round(100.0 * depth))
 
@@ -70,11 +81,11 @@ V = fem.functionspace(
 rule = args.quadrature_degree
 if rule is None and args.domain == "quad" and args.degree == 1:
     rule = 2
+sides = [kit.divided(along, args.domains_per_cell) for along in (across, up)]
+passing = sides[0][(sides[0] > 0.15) & (sides[0] < 0.55)]
+sides[0] = np.union1d(sides[0], kit.divided(passing, args.edge))
 soil = mpm.Particles(
-    kit.grid(
-        [kit.divided(along, args.domains_per_cell) for along in (across, up)],
-        kit.DOMAINS[args.domain],
-    ),
+    kit.grid(sides, kit.DOMAINS[args.domain]),
     V,
     degree=args.degree,
     quadrature_degree=rule,
@@ -158,6 +169,7 @@ numbers = {
     "depth": float(reached[-1]),
     "force": 2.0 * float(force[-1]) / cohesion,
     "ratio": ratio,
+    "curve": [list(point) for point in zip(reached, 2.0 * force / cohesion, strict=True)],
     "iterations_per_step": float(np.mean(history.iterations)) if history.iterations else 0.0,
     "iterations_most": most,
     "penetration": kit.largest(-obstacle.gap) / h,
