@@ -32,9 +32,8 @@ class OwnNames:
         """
         ours = vars(self).setdefault("_set_by_us", {"_set_by_us"})
         classes = [(_is_ours(each.__module__), vars(each)) for each in type(self).__mro__]
-        frame = inspect.currentframe()
-        assert frame is not None and frame.f_back is not None
-        if _is_ours(frame.f_back.f_globals.get("__name__", "")):
+        # (a frame that is kept would keep itself, and all that its callers know)
+        if _is_ours(inspect.currentframe().f_back.f_globals.get("__name__", "")):  # type: ignore[union-attr]
             taken = name in vars(self).keys() - ours
             taken = taken or any(name in each for our, each in classes if not our)
             ours.add(name)
