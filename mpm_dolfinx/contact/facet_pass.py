@@ -24,7 +24,7 @@ from .one_pass import Pass, retold, worn
 from .outcome import Outcome, untouched
 from .pair_matrices import Places
 from .stencil import Start, Stencil, acting
-from .surface import NEAR, Surface
+from .surface import NEAR, Surface, median
 
 __all__ = ["FacetPass"]
 
@@ -100,7 +100,7 @@ class FacetPass(Pass[Past, Meeting]):
 
     def _in_series(self, source: Array, target: Array) -> Array:
         """Return both bodies' stiffnesses one behind the other (collective)."""
-        return 1.0 / (1.0 / source + 1.0 / self._target.median(target))
+        return 1.0 / (1.0 / source + 1.0 / median(self._target.particles.mesh.comm, target))
 
     # -- What it tells ----------------------------------------------------------------------------
 

@@ -372,12 +372,8 @@ class Surface:
     @property
     def size(self) -> float:
         """Median of the sizes of undeformed facets (collective)."""
-        return self.median(self._areas.sum(axis=1) ** (1.0 / (self.gdim - 1)))
-
-    def median(self, values: NDArray[np.float64]) -> float:
-        """Return the median of values at facets, of all ranks (collective)."""
-        every: list[NDArray[np.float64]] = self.particles.mesh.comm.allgather(values)
-        return float(np.median(np.concatenate(every)))
+        sizes = self._areas.sum(axis=1) ** (1.0 / (self.gdim - 1))
+        return median(self.particles.mesh.comm, sizes)
 
     def normals(
         self, converged: bool = False, which: NDArray[np.int64] | None = None
@@ -432,6 +428,11 @@ class Surface:
         thickness = self.of_column(columns["thickness"])[:, 0]
         self.thickness = np.where(known.all(axis=1), thickness, self.thickness)
         self.look_at_deleted()
+
+
+def median(comm: MPI.Comm, values: NDArray[np.float64]) -> float:
+    """Return the median of the values of all ranks (collective)."""
+    return float(np.median(np.concatenate(comm.allgather(values))))
 
 
 def normals(edges: NDArray[Any]) -> NDArray[Any]:
