@@ -19,7 +19,7 @@ from typing import Any, cast
 from mpi4py import MPI
 
 from ..errors import agree, called_last, forget
-from .given import PACKAGE, require_same
+from .given import is_ours, require_same
 from .kinds import explained, require_truths
 
 __all__ = ["Hooked", "asked", "by_itself", "collective", "hooks_of", "is_collective", "of_user"]
@@ -187,7 +187,7 @@ class Hooked:
     def __init_subclass__(cls, **options: Any) -> None:
         """Let ranks agree on what a user overrides."""
         super().__init_subclass__(**options)
-        if cls.__module__.partition(".")[0] == PACKAGE:
+        if is_ours(cls.__module__):
             return
         hooks = hooks_of(cls)
         for name, value in list(vars(cls).items()):
@@ -217,7 +217,7 @@ def hooks_of(cls: type) -> set[str]:
     """Return the names of what a user may override of this package's :class:`Hooked` classes."""
     found, not_asked = set(), set()
     for base in cls.__mro__:
-        if base.__module__.partition(".")[0] != PACKAGE or not issubclass(base, Hooked):
+        if not (is_ours(base.__module__) and issubclass(base, Hooked)):
             continue
         for name, value in vars(base).items():
             if is_collective(value) or hasattr(value, _BY_ITSELF):

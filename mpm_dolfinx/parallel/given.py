@@ -25,19 +25,22 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from ..errors import MPMError, gathered, met
 
 __all__ = [
-    "PACKAGE",
     "as_positive",
     "is_number",
+    "is_ours",
     "options_of",
     "require_same",
     "require_truth",
     "require_whole",
 ]
 
-#: What all modules of this package begin with.
-PACKAGE, *_ = __name__.split(".")
 #: What describes a law besides its parameters.
 KINDS = ("symmetric", "kinematics", "inelastic")
+
+
+def is_ours(module: str) -> bool:
+    """Return whether a module, by its name, is one of this package."""
+    return module.partition(".")[0] == __name__.partition(".")[0]
 
 
 def require_same(comm: MPI.Comm, /, **given: Any) -> None:
@@ -144,7 +147,7 @@ def _parts(name: str, value: Any) -> Iterator[tuple[str, str]]:
             yield from [(key, "an array")] if own else _parts(key, parameter)
     elif hasattr(value, "told"):
         yield from _parts(name, value.told)
-    elif is_dataclass(value) and type(value).__module__.partition(".")[0] == PACKAGE:
+    elif is_dataclass(value) and is_ours(type(value).__module__):
         yield name, type(value).__name__
         for field in fields(value):
             yield from _parts(f"{field.name} of {name}", getattr(value, field.name))

@@ -8,13 +8,9 @@ import inspect
 from typing import Any
 
 from ..errors import MPMError
-from ..parallel.given import PACKAGE
+from ..parallel.given import is_ours
 
 __all__ = ["OwnNames"]
-
-
-def _is_ours(module: str) -> bool:
-    return module.partition(".")[0] == PACKAGE
 
 
 class OwnNames:
@@ -31,9 +27,9 @@ class OwnNames:
             MPMError: A subclass takes one of this package, or has taken it before.
         """
         ours = vars(self).setdefault("_set_by_us", {"_set_by_us"})
-        classes = [(_is_ours(each.__module__), vars(each)) for each in type(self).__mro__]
-        # (a frame that is kept would keep itself, and all that its callers know)
-        if _is_ours(inspect.currentframe().f_back.f_globals.get("__name__", "")):  # type: ignore[union-attr]
+        classes = [(is_ours(each.__module__), vars(each)) for each in type(self).__mro__]
+        # (CPython has frames; one that is kept would keep itself, and all that its callers know)
+        if is_ours(inspect.currentframe().f_back.f_globals.get("__name__", "")):  # type: ignore[union-attr]
             taken = name in vars(self).keys() - ours
             taken = taken or any(name in each for our, each in classes if not our)
             ours.add(name)

@@ -28,7 +28,7 @@ from ..io.series import Output
 from ..io.snapshot import Kept, spaces_of
 from ..parallel.boundary import Hooked, by_itself, collective
 from ..parallel.garbage import Cleaner
-from ..parallel.given import PACKAGE, is_number, require_same
+from ..parallel.given import is_number, is_ours, require_same
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from ..solvers.newton import NewtonSolver
@@ -111,7 +111,7 @@ class Problem(Hooked, OwnNames):
         """Refuse what a user derives from what all problems have alone."""
         super().__init_subclass__(**options)
         cls.keeps_data = cls.converged_state is not Problem.converged_state
-        if Problem in cls.__bases__ and cls.__module__.partition(".")[0] != PACKAGE:
+        if Problem in cls.__bases__ and not is_ours(cls.__module__):
             raise MPMError(
                 f"{cls.__name__} is of mpm.Problem, which is what all problems have and can be "
                 "none; derive it from mpm.ParticleProblem, mpm.QuasiStaticProblem or one of those "
