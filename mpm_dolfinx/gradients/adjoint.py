@@ -30,10 +30,11 @@ from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
 from ..reals import as_reals
 from ..stepping.trial import Trial
+from ..tolerances import DIFFERENCE
 from .backward import Backward, Record, Weights, copied, no_weights
 from .laws import Laws
 from .nearby import varying
-from .parameters import CHANGE, Parameter, as_parameter, largest
+from .parameters import Parameter, as_parameter, largest
 from .sensitivity import require_followed
 
 __all__ = ["Adjoint"]
@@ -431,7 +432,7 @@ class Adjoint:
             own, slopes = np.array(field.acting.moduli), []
             for place in range(len(own)):
                 amount = np.zeros(len(own))
-                amount[place] = CHANGE * own.max()
+                amount[place] = DIFFERENCE * own.max()
                 parts = [
                     field.acting.penalty_force(field.u, (own + s * amount).tolist())
                     for s in (1.0, -1.0)

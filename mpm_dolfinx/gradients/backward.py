@@ -38,7 +38,7 @@ from ..problems.quasistatic import QuasiStaticProblem
 from ..solvers.newton import NewtonSolver
 from ..transfer.matrix import transfer_matrix
 from .laws import Laws
-from .nearby import add_product, varying
+from .nearby import add_product, varying, without_tangents
 
 __all__ = ["Backward", "Record", "Weights", "copied", "no_weights"]
 
@@ -118,9 +118,7 @@ class Backward:
             self._begin(found[-1])
             for body, after in zip(problem.bodies, found[-1].after, strict=True):
                 body.displacement.x.array[:] = after
-            with ExitStack() as blocks:
-                for points in problem.points:
-                    blocks.enter_context(points.asked.without_tangents())
+            with without_tangents(problem):
                 if (failure := self._reduced.terms.update()) is not None:
                     raise failure
             trials = [points.trial.memories() for points in problem.points]

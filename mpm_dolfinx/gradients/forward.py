@@ -37,9 +37,10 @@ from ..problems.motion import MovingProblem
 from ..problems.problem import Problem
 from ..stepping.trial import Trial
 from ..system.value_field import ValueField
+from ..tolerances import DIFFERENCE
 from ..transfer.matrix import transfer_matrix
 from .nearby import Nearby, Rates, add_product, followed, varying
-from .parameters import CHANGE, Parameter
+from .parameters import Parameter
 from .velocities import TakenVelocities, driven_on
 
 __all__ = ["StepDerivative"]
@@ -149,7 +150,7 @@ class StepDerivative:
             rest = self._reduced.unknowns.restricted(forces)
             size = norm(rest)
             first = first or size
-            small = max(SOLVED * first, NOISE * self._size * CHANGE / parameter.change)
+            small = max(SOLVED * first, NOISE * self._size * DIFFERENCE / parameter.change)
             if whole and (size <= small or size > 0.5 * last or tried == MOST):
                 break
             last = size

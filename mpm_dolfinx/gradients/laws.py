@@ -20,7 +20,8 @@ from ..constitutive.governed import Governed
 from ..constitutive.points import MaterialPoints
 from ..materials.base import State
 from ..materials.compiled import CompiledMaterial, Taken
-from .parameters import CHANGE, Parameter
+from ..tolerances import DIFFERENCE
+from .parameters import Parameter
 
 __all__ = ["Laws"]
 
@@ -83,7 +84,7 @@ class Laws:
                 kept = self._weighed(weights, states, self._own[1])
                 return np.column_stack([kept, (P - self._own[0]).reshape(len(P), -1)])
 
-            both = _slope_of(at, CHANGE)
+            both = _slope_of(at, DIFFERENCE)
             found[:, i, J] = both[:, 0]
             slopes[..., i, J] = both[:, 1:].reshape(found.shape)
         axes = tuple(range(1, tangent.ndim))
@@ -171,7 +172,7 @@ class Laws:
                     float(np.abs(side[law][name]).max(initial=0.0))
                     for side in (self._states, self._after)
                 )
-                amount = CHANGE * (size or 1.0)
+                amount = DIFFERENCE * (size or 1.0)
                 if not self._matters(law, name, amount):
                     continue
                 for place in np.ndindex(values.shape[1:]):
@@ -251,7 +252,7 @@ class Laws:
         if averaging is None:
             return direction.reshape(shape), np.zeros(self._shape)
         gradient, sides, energies = self._strained, [], []
-        amount = CHANGE / max(float(np.abs(direction).max(initial=0.0)), 1e-300)
+        amount = DIFFERENCE / max(float(np.abs(direction).max(initial=0.0)), 1e-300)
         comm = points.strain.particles.mesh.comm
         amount = min(comm.allgather(amount))
         modulus = averaging.modulus[:, None]

@@ -26,7 +26,7 @@ from ..problems.problem import Problem
 from ..system.mass import NodalMass
 from .parameters import Parameter
 
-__all__ = ["Nearby", "Rates", "add_product", "followed", "varying"]
+__all__ = ["Nearby", "Rates", "add_product", "followed", "varying", "without_tangents"]
 
 type Array = NDArray[np.float64]
 
@@ -54,6 +54,15 @@ class Rates:
     base: list[Array]
     reactions: list[Array]
     moduli: dict[int, Array]
+
+
+@contextmanager
+def without_tangents(problem: Problem) -> Iterator[None]:
+    """Ask materials for no tangents in the block, but where the stress itself needs them."""
+    with ExitStack() as blocks:
+        for points in problem.points:
+            blocks.enter_context(points.asked.without_tangents())
+        yield
 
 
 def followed(problem: Problem) -> list[Particles | CarriedField]:

@@ -27,10 +27,6 @@ __all__ = ["Parameter", "as_parameter", "largest"]
 
 type Array = NDArray[np.float64]
 
-#: Changes that differences are made of, relative to the parameter. Points between two branches of
-#: a law are the fewer the smaller it is; 1e-5 to 1e-7 give derivatives to ten digits.
-CHANGE = DIFFERENCE
-
 
 class Parameter(ABC):
     """Something that can be changed by an amount, along a direction.
@@ -57,7 +53,8 @@ class Parameter(ABC):
                 "each parameter an amount by which it matters."
             )
         self.name, self.of_law, self.outside = name, of_law, outside
-        self.change = CHANGE * scale
+        # (points between two branches of a law are the fewer the smaller it is)
+        self.change = DIFFERENCE * scale
 
     def shift(self, amount: float) -> None:
         """Change it by an amount from what it was at first; 0 makes it that."""

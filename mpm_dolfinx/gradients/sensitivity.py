@@ -23,7 +23,7 @@ from ..reals import as_reals
 from ..stepping.control import Run
 from ..stepping.trial import Trial
 from .forward import StepDerivative
-from .nearby import Nearby, Rates, followed, varying
+from .nearby import Nearby, Rates, followed, varying, without_tangents
 from .parameters import as_parameter
 
 __all__ = ["Sensitivity", "require_followed"]
@@ -178,9 +178,7 @@ class Sensitivity:
         problem = self.problem
         with self._nearby.held():
             step = StepDerivative(problem, trial, self._nearby)
-            with ExitStack() as blocks:
-                for points in problem.points:
-                    blocks.enter_context(points.asked.without_tangents())
+            with without_tangents(problem):
                 pairs = zip(self._parameters, rates, strict=True)
                 found = [step.by(parameter, one) for parameter, one in pairs]
         assert newton.x is not None and newton.F is not None

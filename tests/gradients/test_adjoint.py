@@ -221,50 +221,46 @@ def both_ways(prepared):
     return ends
 
 
-def test_a_law_that_remembers_without_being_inelastic():
+def check_slump(law, numbers, steps, tolerance):
+    """Compare both ways for a slump of a law, by all its numbers."""
+
     def prepared():
-        scene = Slump(lambda young: Wearing(young, 0.3), {"young": 5e4, "weight": 1e3})
+        scene = Slump(law, numbers)
         d = scene.particles.displacement
-        parameters = [scene.named[name] for name in ("young", "weight")]
         form = 0.5 * ufl.inner(d, d) * ufl.dx
-        return scene.problem, parameters, form, lambda: scene.problem.solve(3)
+        parameters = [scene.named[name] for name in numbers]
+        return scene.problem, parameters, form, lambda: scene.problem.solve(steps)
 
     one, other = both_ways(prepared)
-    assert np.abs(one / other - 1.0).max() < 1e-8, (one, other)
+    assert np.abs(one / other - 1.0).max() < tolerance, (one, other)
 
 
-@pytest.mark.parametrize("law", ["Tresca", "von Mises"])
+SOFT = {"young": 5e4, "weight": 1e3}
+
+
+def test_a_law_that_remembers_without_being_inelastic():
+    check_slump(lambda young: Wearing(young, 0.3), SOFT, 3, 1e-8)
+
+
+SOFTENING = {
+    "Tresca": lambda young: materials.Tresca(young, 0.45, 500.0).with_softening(
+        5.0, cohesion=400.0
+    ),
+    "von Mises": lambda young: materials.VonMises(young, 0.3, 700.0).with_softening(
+        5.0, residual=0.8
+    ),
+}
+
+
+@pytest.mark.parametrize("law", SOFTENING)
 def test_a_strength_that_falls_with_the_history(law):
     """It is no number of the compiled return alone: by that, derivatives are off by 1e-3."""
-
-    def prepared():
-        def softening(young):
-            if law == "Tresca":
-                return materials.Tresca(young, 0.45, 500.0).with_softening(5.0, cohesion=400.0)
-            return materials.VonMises(young, 0.3, 700.0).with_softening(5.0, residual=0.8)
-
-        scene = Slump(softening, {"young": 5e4, "weight": 1e3})
-        d = scene.particles.displacement
-        parameters = [scene.named[name] for name in ("young", "weight")]
-        form = 0.5 * ufl.inner(d, d) * ufl.dx
-        return scene.problem, parameters, form, lambda: scene.problem.solve(4)
-
-    one, other = both_ways(prepared)
-    assert np.abs(one / other - 1.0).max() < 1e-7, (one, other)
+    check_slump(SOFTENING[law], SOFT, 4, 1e-7)
 
 
 def test_what_materials_keep_is_found_again_where_it_was_not_noted():
     """Of eight steps it is noted once."""
-
-    def prepared():
-        scene = Slump(von_mises, VON_MISES)
-        d = scene.particles.displacement
-        parameters = [scene.named[name] for name in VON_MISES]
-        form = 0.5 * ufl.inner(d, d) * ufl.dx
-        return scene.problem, parameters, form, lambda: scene.problem.solve(10)
-
-    one, other = both_ways(prepared)
-    assert np.abs(one / other - 1.0).max() < 1e-8, (one, other)
+    check_slump(von_mises, VON_MISES, 10, 1e-8)
 
 
 def test_bodies_that_stick_by_their_joints():
