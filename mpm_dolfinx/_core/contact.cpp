@@ -193,6 +193,18 @@ Ways<T, dim, bends> ways_of(const Shapes<dim>& shapes, const std::array<T, dim>*
   return ways;
 }
 
+// Where a point's foot is, by places of its stencil: the one thing that goes with the kind of facets.
+template <typename T, int dim>
+using FootAt = Foot<T, dim> (*)(const Shapes<dim>& shapes, const std::array<T, dim>* x,
+                                double outward);
+
+template <typename T, int dim, int bends>
+HOT_PART Foot<T, dim> foot_at(const Shapes<dim>& shapes, const std::array<T, dim>* x,
+                              double outward)
+{
+  return foot_of(ways_of<T, dim, bends>(shapes, x), outward);
+}
+
 // The way of a point from its anchor, by places of its stencil.
 template <typename T, int dim>
 std::array<T, dim> delta_of(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x)
@@ -338,12 +350,12 @@ HOT_PART Traction<T, dim> traction_at(const core::Touching& known, std::size_t p
 }
 
 // Set what acts at a point by places of its stencil, with a pressure on top where one acts.
-template <int bends, int dim, typename T>
-HOT_PART void act_at(const core::Meeting& m, std::size_t p, const std::array<T, dim>* x,
-                     Acting<T, dim>& found, const T* top = nullptr)
+template <int dim, typename T>
+HOT_PART void act_at(const core::Meeting& m, FootAt<T, dim> project, std::size_t p,
+                     const std::array<T, dim>* x, Acting<T, dim>& found, const T* top = nullptr)
 {
   const Shapes<dim> shapes(m.table, p, m.nodes);
-  const auto foot = foot_of(ways_of<T, dim, bends>(shapes, x), m.outward[p]);
+  const auto foot = project(shapes, x, m.outward[p]);
   const auto delta = delta_of<T, dim>(m, p, x);
   if (!m.start)
   {
@@ -366,7 +378,7 @@ HOT_PART void act_at(const core::Meeting& m, std::size_t p, const std::array<T, 
       change[k][i] = x[k][i] - T(start[k][i]);
     }
   const Shapes<dim> there(m.middle, p, m.nodes);
-  const auto half = foot_of(ways_of<T, dim, bends>(there, middle.data()), m.outward[p]);
+  const auto half = project(there, middle.data(), m.outward[p]);
   const auto press = mean_pressing(m.known, p, m.before[p] - m.offset[p],
                                    T(foot.gap - T(m.offset[p])));
   found.acts = traction_at<T, dim>(m.known, p, press, foot.gap, half.n, delta);
@@ -382,15 +394,14 @@ HOT_PART void act_at(const core::Meeting& m, std::size_t p, const std::array<T, 
   found.push();
 }
 
-// (One function of all kinds would take compilers twice as long.)
-template <int dim, int bends>
-HOT_LOOP void act_in(const core::Meeting& m, const core::Met& result)
+template <int dim>
+void act_in(const core::Meeting& m, FootAt<double, dim> project, const core::Met& result)
 {
   Acting<double, dim> found(m.nodes);
   const std::size_t width = (1 + m.nodes) * dim;
   for (std::size_t p = 0; p < m.points; ++p)
   {
-    act_at<bends, dim>(m, p, places_of<dim>(m.x, p, m.count), found);
+    act_at<dim>(m, project, p, places_of<dim>(m.x, p, m.count), found);
     std::copy_n(found.pushes[0].data(), width, result.pushes + p * width);
     std::copy_n(found.rubs[0].data(), width, result.rubs + p * width);
     result.pressure[p] = found.acts.pressure;
@@ -399,8 +410,9 @@ HOT_LOOP void act_in(const core::Meeting& m, const core::Met& result)
   }
 }
 
-template <int dim, int bends>
-HOT_LOOP void differentiate_by_pressure_in(const core::Meeting& m, double* slopes)
+template <int dim>
+void differentiate_by_pressure_in(const core::Meeting& m, FootAt<Dual<together>, dim> project,
+                                  double* slopes)
 {
   using T = Dual<together>;
   T top;
@@ -412,20 +424,21 @@ HOT_LOOP void differentiate_by_pressure_in(const core::Meeting& m, double* slope
     const auto* places = places_of<dim>(m.x, p, m.count);
     for (int k = 0; k < m.count; ++k)
       std::copy_n(places[k].begin(), dim, x[k].begin());
-    act_at<bends, dim>(m, p, x.data(), found, &top);
+    act_at<dim>(m, project, p, x.data(), found, &top);
     for (int k = 0; k <= m.nodes; ++k)
       for (int i = 0; i < dim; ++i)
         *slopes++ = (found.pushes[k][i] + found.rubs[k][i]).by[0];
   }
 }
 
-template <int dim, int bends>
-void see_in(const core::Meeting& m, double* gap, double* n, double* delta)
+template <int dim>
+void see_in(const core::Meeting& m, FootAt<double, dim> project, double* gap, double* n,
+            double* delta)
 {
   for (std::size_t p = 0; p < m.points; ++p)
   {
     const auto* x = places_of<dim>(m.x, p, m.count);
-    auto foot = foot_of(ways_of<double, dim, bends>({m.table, p, m.nodes}, x), m.outward[p]);
+    auto foot = project({m.table, p, m.nodes}, x, m.outward[p]);
     gap[p] = foot.gap;
     if (m.start)
     {
@@ -435,7 +448,7 @@ void see_in(const core::Meeting& m, double* gap, double* n, double* delta)
         for (int i = 0; i < dim; ++i)
           middle[k][i] = 0.5 * (start[k][i] + x[k][i]);
       const Shapes<dim> there(m.middle, p, m.nodes);
-      foot = foot_of(ways_of<double, dim, bends>(there, middle.data()), m.outward[p]);
+      foot = project(there, middle.data(), m.outward[p]);
     }
     const auto way = delta_of<double, dim>(m, p, x);
     std::copy_n(foot.n.data(), dim, n + p * dim);
@@ -561,8 +574,9 @@ HOT_PART void differentiate_at(const core::Meeting& m, std::size_t p, double* D,
 }
 
 // Set the same of a step of a motion, by the places of all nodes.
-template <int dim, int bends>
-HOT_PART void differentiate_step_at(const core::Meeting& m, std::size_t p, double* D)
+template <int dim>
+HOT_PART void differentiate_step_at(const core::Meeting& m, FootAt<Dual<together>, dim> project,
+                                    std::size_t p, double* D)
 {
   using T = Dual<together>;
   Acting<T, dim> found(m.nodes);
@@ -578,7 +592,7 @@ HOT_PART void differentiate_step_at(const core::Meeting& m, std::size_t p, doubl
     const int here = std::min(together, width - first);
     for (int k = 0; k < here; ++k)
       x[(first + k) / dim][(first + k) % dim].by.set(k, 1.0);
-    act_at<bends, dim>(m, p, x.data(), found);
+    act_at<dim>(m, project, p, x.data(), found);
     for (int k = 0; k < here; ++k)
       x[(first + k) / dim][(first + k) % dim].by.set(k, 0.0);
     for (int row = 0; row < rows; ++row)
@@ -628,7 +642,7 @@ HOT_LOOP void add_tangents_in(const core::Meeting& m, const core::Sums& sums)
   for (std::size_t p = 0; p < m.points; ++p)
   {
     if (m.start)
-      differentiate_step_at<dim, bends>(m, p, D.data());
+      differentiate_step_at<dim>(m, foot_at<Dual<together>, dim, bends>, p, D.data());
     else
       differentiate_at<dim, bends>(m, p, D.data(), work);
     add_at<dim>(sums, p, m.nodes, m.count, D.data());
@@ -640,6 +654,8 @@ template <int dim_, int bends_>
 struct Kind
 {
   static constexpr int dim = dim_, bends = bends_;
+  template <typename T>
+  static constexpr FootAt<T, dim> project = foot_at<T, dim, bends>;
 };
 
 // Call a function with the kind of the facets.
@@ -662,21 +678,22 @@ void with_kind(int dim, int nodes, F&& f)
 void core::act(const Meeting& meeting, int dim, const Met& result)
 {
   with_kind(dim, meeting.nodes, [&](auto kind) {
-    act_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, result);
+    act_in<decltype(kind)::dim>(meeting, decltype(kind)::template project<double>, result);
   });
 }
 
 void core::differentiate_by_pressure(const Meeting& meeting, int dim, double* slopes)
 {
   with_kind(dim, meeting.nodes, [&](auto kind) {
-    differentiate_by_pressure_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, slopes);
+    differentiate_by_pressure_in<decltype(kind)::dim>(
+        meeting, decltype(kind)::template project<Dual<together>>, slopes);
   });
 }
 
 void core::see(const Meeting& meeting, int dim, double* gap, double* n, double* delta)
 {
   with_kind(dim, meeting.nodes, [&](auto kind) {
-    see_in<decltype(kind)::dim, decltype(kind)::bends>(meeting, gap, n, delta);
+    see_in<decltype(kind)::dim>(meeting, decltype(kind)::template project<double>, gap, n, delta);
   });
 }
 
