@@ -24,6 +24,7 @@ from .meshes.regions import cell_tags, facet_tags, held, region  # noqa: E402
 from .particles.field import ParticleField  # noqa: E402
 from .particles.particles import Particles  # noqa: E402
 from .particles.probe import probe  # noqa: E402
+from .particles.sections import SectionForces, section_forces  # noqa: E402
 from .problems.body import Body, PoreFluid  # noqa: E402
 from .problems.dynamic import DynamicParticleProblem, DynamicProblem  # noqa: E402
 from .problems.initial_stress import geostatic  # noqa: E402
@@ -76,6 +77,7 @@ __all__ = [
     "Rates",
     "Record",
     "Scheme",
+    "SectionForces",
     "Sensitivity",
     "Solver",
     "Stage",
@@ -100,6 +102,7 @@ __all__ = [
     "plot",
     "probe",
     "region",
+    "section_forces",
     "strength_reduction",
     "taped",
 ]

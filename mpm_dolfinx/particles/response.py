@@ -21,6 +21,10 @@ __all__ = ["MaterialDomains", "Response"]
 class Kinematics(Protocol):
     """Kinematics of the points of a body."""
 
+    @property
+    def hoop(self) -> NDArray[np.float64] | None:
+        """Hoop strains of the nodes of a body of revolution, or ``None``."""
+
     def gradient(self) -> NDArray[np.float64]:
         """Return ``F - I`` at the points, shape ``(n, nq, dim, dim)``."""
 
@@ -146,6 +150,20 @@ class MaterialDomains(Domains):
             MPMError: The particles have no material (a problem written in UFL).
         """
         return self._answering("stress").last.cauchy_stress()
+
+    @property
+    def point_total_stress(self) -> NDArray[np.float64]:
+        """Cauchy stress of the skeleton and the water in it, shape ``(n, nq, 3, 3)``."""
+        stress = self.point_stress
+        if not self._water:
+            return stress
+        water = self._water[0].at_points()
+        return np.asarray(stress - water[..., None, None] * np.eye(3))
+
+    @property
+    def revolves(self) -> bool:
+        """Whether a problem takes it for a body of revolution."""
+        return self._response is not None and self._response.strain.hoop is not None
 
     @property
     def point_plastic_strain(self) -> NDArray[np.float64]:
