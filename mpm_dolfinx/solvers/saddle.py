@@ -15,10 +15,6 @@ from .multigrid import Multigrid
 
 __all__ = ["Fields", "SaddleMultigrid"]
 
-#: What is added to A's diagonal, relative to the square of cells' size over the body's: beside a
-#: pressure a body has no stiffness of its own to a change of volume.
-SOFT = 0.3
-
 
 class Fields(Protocol):
     """Unknowns of several fields, as multigrid must know them. All calls are collective."""
@@ -77,7 +73,8 @@ class SaddleMultigrid:
 
     with c from one vector p, and a V cycle for ``A^-1``. D has the storage and the diffusion of a
     pore pressure. A residual (f, g) becomes ``p = S^-1 g``, ``u = A^-1 (f - B p)``. Where p carries
-    all change of volume, A is singular for a body that swells; a small share of its diagonal helps.
+    all change of volume, A is singular for a body that swells; its diagonal grows by a share, the
+    square of the cells' size over the body's.
 
     Args:
         pc: The preconditioner (collective).
@@ -125,7 +122,7 @@ class SaddleMultigrid:
         """Add to the diagonal of A as much as its smallest eigenvalues are."""
         diagonal = A.getDiagonal()
         diagonal.abs()
-        diagonal.scale(SOFT * (A.getSize()[0] / self._dim) ** (-2.0 / self._dim))
+        diagonal.scale((A.getSize()[0] / self._dim) ** (-2.0 / self._dim))
         A.setDiagonal(diagonal, addv=PETSc.InsertMode.ADD_VALUES)
 
     def _take(self, number: int, matrix: PETSc.Mat) -> None:
