@@ -20,16 +20,13 @@ from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, agree, agreed
 from ..system.own import OwnUnknowns
-from ..tolerances import HALF_DIGITS, LAST_PLACES, LOCAL_ITERATIONS, NEGLIGIBLE
+from ..tolerances import HALF_DIGITS, INEXACT, LAST_PLACES, LOCAL_ITERATIONS, NEGLIGIBLE
 from .body_contact import BodyContact
 from .rigid_motion import RigidMotion, State
 from .rotation import QUARTER, Pose
 
 __all__ = ["RigidBalance"]
 
-#: Share of its forces that nothing bears above which a body at rest is brought nearer to balance
-#: before a step.
-UNBALANCED = 0.1
 #: Drag on a body that creeps to its balance, over the largest stiffness, to begin with; by how much
 #: it rises where the residual becomes larger than by a factor.
 DRAG, RISES, GROWS = 0.1, 4.0, 2.0
@@ -227,7 +224,7 @@ class RigidBalance:
         drag, now = 0.0, self._tried(step)
         for _ in range(LOCAL_ITERATIONS):
             norm = float(np.linalg.norm(now.left))
-            if norm <= UNBALANCED * now.size or (now.touches and not self._creeps):
+            if norm <= INEXACT * now.size or (now.touches and not self._creeps):
                 break
             with agree(self._comm):  # of the slopes of a user's shape
                 parts = [contact.of_own(motion.centres, motion.theta) for contact in self._contacts]

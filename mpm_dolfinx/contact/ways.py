@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..tolerances import LOCAL_ITERATIONS
+from ..tolerances import LOCAL_ITERATIONS, SLIGHT
 from .memory import ShapeMemory
 from .placed import framed
 from .rotation import Pose
@@ -22,9 +22,8 @@ from .surface import Surface
 
 __all__ = ["OPPOSITE", "goes_through", "passes"]
 
-#: How near to the surface a point is on it, over the thickness of the domain behind.
-ON = 1e-3
-#: Least length of a way through an obstacle, over the same: less is cut off a sharp corner.
+#: Least length of a way through an obstacle, over the thickness of the domain behind: less is cut
+#: off a sharp corner.
 CUT = 0.02
 #: Least cosine between a way and the normal of a surface that it goes through.
 STEEP = 0.1
@@ -76,7 +75,7 @@ def goes_through(
     if len(a) == 0:
         return False
     end, normal_at_end = shape.distance(b)
-    deep, on = np.maximum(-gap, 0.0) + thickness, ON * thickness
+    deep, on = np.maximum(-gap, 0.0) + thickness, SLIGHT * thickness
     if (end < -deep).any():
         return True
     way = b - a

@@ -11,16 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
-from ..tolerances import LAST_PLACES, ROUND_OFF, SOLVED
+from ..tolerances import LAST_PLACES, LOCAL_ITERATIONS, ROUND_OFF, SOLVED
 from .base import Integration, State
 from .derivatives import difference_by_stress, slope_by_plastic_strain, slope_by_stress
 from .mandel import norm
 from .plastic import PlasticMaterial
 
 __all__ = ["ReturnMapping"]
-
-HALVINGS = 12
-"""Times that the line search halves a Newton step."""
 
 
 class ReturnMapping(PlasticMaterial):
@@ -295,7 +292,7 @@ def _solve(system: _System, max_iterations: int) -> tuple[NDArray[np.float64], N
         new_residual = now.residual(new)
         new_size = norm(new_residual) / goal[active]
         at_floor = old_size <= SOLVED  # round-off may be what stops the decrease
-        for _ in range(HALVINGS):
+        for _ in range(LOCAL_ITERATIONS):
             (rising,) = np.nonzero(~(new_size < old_size) & ~at_floor)
             if len(rising) == 0:
                 break

@@ -26,7 +26,7 @@ from ..tolerances import SMALL
 from .cells import coordinate_element, input_cell_index
 from .redistribution import Carrier, neighbour_ranks
 
-__all__ = ["HALVES", "HALVES_OF_MASS", "PLACES", "Column", "Cuts", "Place", "Remesh", "diagonals"]
+__all__ = ["HALVES", "PLACES", "Column", "Cuts", "Place", "Remesh", "diagonals"]
 
 type Cuts = NDArray[np.int64]
 """Global index and diagonal of quadrilaterals to be cut, shape ``(m, 2)``, on all ranks.
@@ -58,13 +58,9 @@ class Column(NamedTuple):
     at: Place
 
 
-#: Corners of the two halves of a quadrilateral, by diagonal. Corner ``DOUBLED`` of each half is a
-#: new vertex in the place of its last one.
+#: Corners of the two halves of a quadrilateral, by diagonal. One of each half is there twice: first
+#: as a new vertex in the place of the last one. All that are at a corner share its mass.
 HALVES = np.array([[[0, 1, 3, 3], [0, 3, 2, 3]], [[1, 3, 2, 2], [1, 2, 0, 2]]])
-DOUBLED = (2, 1)
-#: What share of the mass at its corners each half gets: half of those on the diagonal, of which two
-#: in one place share that.
-HALVES_OF_MASS = np.array([[0.5, 1.0, 0.25, 0.25], [0.5, 0.25, 1.0, 0.25]])
 
 
 def diagonals(
@@ -177,10 +173,13 @@ class Remesh(Carrier):
         places = _Nodes.of_geometry(source) if space is None else _Nodes.of_space(space)
         nodes = places.of_cells[: len(index)]
         own, both = np.arange(nodes.shape[1]), (0, 1) if len(cut) else ()
+        doubled = (HALVES[..., :-1] == HALVES[..., -1:]).argmax(axis=-1)
+        every = HALVES.reshape(len(HALVES), 1, 1, -1)
+        times = (HALVES[..., None] == every).sum(axis=-1)
         corners = np.broadcast_to(own, (len(index), len(own)))[whole]
         self._corners = np.concatenate([corners, *(HALVES[diagonal, half] for half in both)])
         self._parts = np.concatenate(
-            [np.ones(corners.shape), *(HALVES_OF_MASS[[half] * len(cut)] for half in both)]
+            [np.ones(corners.shape), *(1.0 / times[diagonal, half] for half in both)]
         )
 
         x, numbering = places.x, places.numbering
@@ -192,12 +191,10 @@ class Remesh(Carrier):
         numbers = old + added[np.searchsorted(firsts, old, side="right") - 1]
         corners = np.take_along_axis(nodes[self._parents], self._corners, axis=1)
         cells = numbers[corners]
-        new = np.arange(len(index) - len(cut), len(cells))
-        cells[new, np.repeat(DOUBLED, len(cut))] = (
-            numbering.local_range[1] + added[comm.rank] + np.arange(len(new))
-        )
+        new, twins = np.arange(len(index) - len(cut), len(cells)), doubled[diagonal].ravel("F")
+        cells[new, twins] = numbering.local_range[1] + added[comm.rank] + np.arange(len(new))
         self._copies = np.zeros(self._corners.shape, dtype=bool)
-        self._copies[new, np.repeat(DOUBLED, len(cut))] = True
+        self._copies[new, twins] = True
         points = np.concatenate([x[: numbering.size_local], x[corners[new, -1]]])
 
         ranks = np.full(len(index), comm.rank, dtype=np.int64)

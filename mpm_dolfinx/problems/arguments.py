@@ -15,6 +15,7 @@ import ufl
 from dolfinx import fem, mesh
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.domain import extract_unique_domain
+from ufl.measure import integral_type_to_measure_name
 
 from .. import _compat
 from ..assembly.inputs import is_tag
@@ -43,9 +44,7 @@ __all__ = [
     "residuals_of",
 ]
 
-#: Names of the measures of integrals, and how many dimensions less than the mesh they have.
-MEASURES = {"cell": ("dx", 0), "exterior_facet": ("ds", 1), "interior_facet": ("dS", 1)}
-#: Where they are.
+#: Where integrals of these types are.
 PLACES = {"cell": "of the mesh", "exterior_facet": "on the boundary", "interior_facet": "inside"}
 
 
@@ -266,10 +265,9 @@ def _require_tags(integral: ufl.Integral, domain: mesh.Mesh, name: str, where: s
         integral.subdomain_id(),
         integral.subdomain_data(),
     )
-    measure, codim = MEASURES.get(kind, (kind, None))
-    if codim is None:
+    if kind not in PLACES:
         return
-    dim = domain.topology.dim - codim
+    measure, dim = integral_type_to_measure_name[kind], domain.topology.dim - (kind != "cell")
     if isinstance(data, mesh.MeshTags):
         if not _compat.are_tags_of(data, domain):
             raise MPMError(

@@ -17,13 +17,8 @@ from ..stabilisation.choice import STABILISATIONS
 
 __all__ = ["Solver", "as_solver"]
 
-#: Least values of PETSc's tolerances and numbers of iterations, and what they are below.
-TOLERANCES = {
-    "rtol": (0.0, 1.0),
-    "atol": (0.0, np.inf),
-    "stol": (0.0, np.inf),
-    "max_it": (1.0, np.inf),
-}
+#: PETSc's tolerances, and its number of iterations.
+TOLERANCES = ("rtol", "atol", "stol", "max_it")
 
 
 @dataclass(frozen=True)
@@ -143,10 +138,9 @@ def _require_tolerance(name: str, value: Any) -> None:
     It takes some negative values for "as it was", and reads none where nothing iterates.
     """
     solver, _, what = name.rpartition("snes_" if "snes_" in name else "ksp_")
-    bounds = TOLERANCES.get(what)
-    if not name.startswith(("snes_", "ksp_")) or solver or bounds is None or value is None:
+    if not name.startswith(("snes_", "ksp_")) or solver or what not in TOLERANCES or value is None:
         return
-    least, below = bounds
+    least, below = float(what == "max_it"), 1.0 if what == "rtol" else np.inf
     try:
         number = float(value)
     except (TypeError, ValueError):
