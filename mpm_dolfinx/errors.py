@@ -9,6 +9,7 @@ therefore meets the others where these agree next, and all end with its error.
 
 from __future__ import annotations
 
+import os
 import pickle
 import re
 import sys
@@ -292,17 +293,19 @@ def as_ours(error: Exception, what: str) -> MPMError:
     return ours
 
 
-def warn(comm: MPI.Comm, sentence: str, stacklevel: int = 2) -> None:
+def warn(comm: MPI.Comm, sentence: str) -> None:
     """Warn the user on rank 0; where that is an error (``-W error``), it is on all (collective).
+
+    The warning is of the line that called this package.
 
     Args:
         comm: The ranks.
         sentence: The warning.
-        stacklevel: As for ``warnings.warn``, where this function is called.
     """
     with agree(comm):
         if comm.rank == 0:
-            warnings.warn(sentence, stacklevel=stacklevel + 1)
+            here = os.path.join(os.path.dirname(__file__), "")
+            warnings.warn(sentence, skip_file_prefixes=(here,))
 
 
 def _sendable(error: BaseException) -> BaseException:

@@ -177,7 +177,6 @@ class Support:
                 f"A support has the stiffness that the first material gave it, and the present one "
                 f"is {stiffer:.3g} times as stiff, so that the support gives way as much more of "
                 "its strain; give the support modulus=, that of the stiffest material.",
-                stacklevel=6,
             )
 
     def follow(self, moduli: Callable[[], NDArray[np.float64]]) -> None:

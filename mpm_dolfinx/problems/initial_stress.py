@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,16 +17,20 @@ import ufl
 from dolfinx import fem
 
 from ..assembly.inputs import as_expression
-from ..errors import MPMError, agree, as_ours
+from ..errors import MPMError, agree, as_ours, warn
 from ..meshes.quadrature import quadrature_rule
 from ..parallel.compilation import compiled_expression
 from ..particles.particles import Particles
 from ..reals import as_reals
+from .body import Body
 from .water_table import WaterTable
 
-__all__ = ["geostatic", "initial_stress_at_points"]
+__all__ = ["geostatic", "initial_stress_at_points", "warn_of_other_ground"]
 
 type Array = NDArray[np.float64]
+
+#: Share of the weight, or of the largest stress, from which ground is not what geostatic was told.
+NOTICED = 0.01
 
 
 @dataclass(frozen=True)
@@ -59,9 +65,24 @@ class _Geostatic:
                 "dimensions; give it the body_force."
             )
 
-    def __call__(self, x: Array) -> Array:
+    def weight(self, x: Array) -> Array:
+        """Return the weight per volume that the stress balances, a vector ``(3, n)``."""
+        depth, layer = self._layer(x)
+        return np.outer(self.down, np.where(depth >= 0.0, self.densities[layer], 0.0)) * (
+            self.strength
+        )
+
+    def vertical(self, x: Array) -> Array:
+        """Return the vertical stress, positive in compression, shape ``(n,)``."""
+        return np.asarray(-self.down @ np.einsum("ijn,j->in", self(x), self.down))
+
+    def _layer(self, x: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Return depths below the surface, and the numbers of layers."""
         depth = self.surface + self.down @ x
-        layer = np.clip(np.searchsorted(self.tops, depth, side="right") - 1, 0, None)
+        return depth, np.clip(np.searchsorted(self.tops, depth, side="right") - 1, 0, None)
+
+    def __call__(self, x: Array) -> Array:
+        depth, layer = self._layer(x)
         unit = self.densities[layer] * self.strength
         vertical = self.loads[layer] + unit * (depth - self.tops[layer])
         if self.water is not None:
@@ -87,7 +108,7 @@ def geostatic(
 
     The vertical stress is the weight of what lies above, the horizontal one is K0 times it (the
     K0 procedure). Under its body force, with sides and base that do not move, such ground is in
-    equilibrium as it is.
+    equilibrium as it is. A problem warns where the body has another weight, water or surface.
 
     Args:
         surface: Level of the ground, measured against gravity: ``x[1]`` for gravity ``(0, -g)``.
@@ -135,6 +156,137 @@ def geostatic(
     return _Geostatic(float(surface), strength, down, tops, densities, ratios, loads, water)
 
 
+def warn_of_other_ground(given: Sequence[Body], every: Sequence[Body]) -> None:
+    """Warn where :func:`geostatic` was told of other ground than bodies are (collective).
+
+    Its stress balances a weight and a pressure of water at each point, and what acts on the highest
+    place. That the ground slopes below its surface is meant to be possible.
+
+    Args:
+        given: Bodies that have not moved.
+        every: These, and what else is there.
+    """
+    for body in given:
+        stress = body.initial_stress
+        if not isinstance(stress, _Geostatic):
+            continue
+        found = (
+            _other_weight(stress, body)
+            or _other_water(stress, body)
+            or _other_surface(stress, body, every)
+        )
+        if found:
+            warn(
+                body.particles.mesh.comm,
+                f"initial_stress= is not that of the body: {found}; the body moves by the "
+                "difference as its loads come.",
+            )
+
+
+def _other_weight(stress: _Geostatic, body: Body) -> str:
+    """Tell where a body has another weight than geostatic was told, if it has (collective)."""
+    particles = body.particles
+    gdim = particles.mesh.geometry.dim
+    told = stress.weight(_coordinates(particles))[:gdim]
+    weight = np.zeros_like(told)
+    if body.body_force is not None:
+        density = 1.0 if body.density is None else body.density
+        force = as_expression(body.body_force, particles, "body_force", (gdim,))
+        mass = as_expression(density, particles, "density", ())
+        product = _evaluated(force, particles) * _evaluated(mass, particles)[..., None]
+        weight = product.reshape(-1, gdim).T
+    return _where_other(
+        particles, "density times body_force", weight, told, np.linalg.norm(told, axis=0)
+    )
+
+
+def _other_water(stress: _Geostatic, body: Body) -> str:
+    """Tell where a body has another pore pressure at rest than geostatic was told (collective)."""
+    particles, x = body.particles, _coordinates(body.particles)
+    known, water = body.pore_pressure, stress.water
+    if body.pore_fluid is not None or (
+        water is not None and known is not None and not isinstance(known, WaterTable)
+    ):
+        return ""
+    told = np.zeros(x.shape[1]) if water is None else water.on(-(stress.down @ x), x)
+    pressure = np.zeros_like(told)
+    if known is not None:
+        p = as_expression(known, particles, "pore_pressure", ())
+        pressure = _evaluated(p, particles).ravel()
+    size = np.maximum(stress.vertical(x), 0.0) + told
+    return _where_other(particles, "pore_pressure", pressure[None], told[None], size)
+
+
+def _where_other(particles: Particles, name: str, here: Array, told: Array, size: Array) -> str:
+    """Tell where something is another than geostatic was told, if it is in the mean (collective).
+
+    Args:
+        particles: The body.
+        name: What it is.
+        here: Values at its points, shape ``(k, n)``.
+        told: Those of geostatic.
+        size: What they are measured by, shape ``(n,)``.
+    """
+    comm, gdim = particles.mesh.comm, particles.mesh.geometry.dim
+    off = np.linalg.norm(here - told, axis=0)
+    if comm.allreduce(off.sum()) <= NOTICED * comm.allreduce(size.sum()):
+        return ""
+    worst: list[Any] = []
+    if len(off):
+        at = int(off.argmax())
+        place = _coordinates(particles)[:gdim]
+        worst = [float(off[at]), *(v[:, at].tolist() for v in (place, here, told))]
+    _, place, has, expected = max(comm.allgather(worst))
+    return (
+        f"at {_in_words(place)} the body has a {name} of {_in_words(has)}, and mpm.geostatic of "
+        f"{_in_words(expected)}"
+    )
+
+
+def _other_surface(stress: _Geostatic, body: Body, every: Sequence[Body]) -> str:
+    """Tell of a stress at what is highest, where nothing acts, if there is one (collective)."""
+    if any(other.tractions or other.pressures for other in every):
+        return ""
+    comm = body.particles.mesh.comm
+    nodes = np.vstack([other.particles.mesh.geometry.x for other in every])
+    height = -(nodes @ stress.down)
+    top = comm.allreduce(height.max(initial=-np.inf), MPI.MAX)
+    there = stress.vertical(nodes[height == top].T).max(initial=0.0)
+    most = stress.vertical(_coordinates(body.particles)).max(initial=0.0)
+    there, most = (comm.allreduce(value, MPI.MAX) for value in (there, most))
+    if there <= NOTICED * most:
+        return ""
+    return (
+        f"nothing acts on its top at {top:g}, where mpm.geostatic, with a surface at "
+        f"{stress.surface:g}, has a vertical stress of {there:g}"
+    )
+
+
+def _in_words(values: Sequence[float]) -> str:
+    words = ", ".join(f"{value + 0.0:g}" for value in values)
+    return words if len(values) == 1 else f"({words})"
+
+
+def _coordinates(particles: Particles) -> Array:
+    """Return where the history's points were at first, shape ``(3, n nq)``."""
+    points = particles.initial_points.reshape(-1, particles.initial_points.shape[-1])
+    x = np.zeros((3, len(points)))
+    x[: points.shape[1]] = points.T
+    return x
+
+
+def _evaluated(value: Any, particles: Particles) -> Array:
+    """Return UFL on the body mesh at the history's points, shape ``(n, nq, ...)`` (collective)."""
+    n, nq = particles.num_local, particles.num_points
+    if isinstance(value, fem.Constant):
+        return np.broadcast_to(value.value, (n, nq, *value.ufl_shape))
+    value = fem.Constant(particles.mesh, 1.0) * value  # UFL that is a number knows no ranks
+    points, _ = quadrature_rule(particles.mesh.basix_cell(), particles.geometry.quadrature_degree)
+    at_points = compiled_expression(value, points, particles.mesh.comm)
+    evaluated: Any = at_points.eval(particles.mesh, np.arange(n, dtype=np.int32))
+    return np.asarray(evaluated.reshape(n, nq, *value.ufl_shape))
+
+
 def initial_stress_at_points(value: Any, particles: Particles) -> Array:
     """Return an initial stress at the history's points (collective).
 
@@ -148,17 +300,9 @@ def initial_stress_at_points(value: Any, particles: Particles) -> Array:
     Raises:
         MPMError: It is something else, of another shape, or not finite.
     """
-    n, nq = particles.num_local, particles.num_points
     if isinstance(value, ufl.core.expr.Expr):
         made = as_expression(value, particles, "initial_stress", (3, 3))
-        made = fem.Constant(particles.mesh, 1.0) * made  # a constant one knows no ranks
-        points, _ = quadrature_rule(
-            particles.mesh.basix_cell(), particles.geometry.quadrature_degree
-        )
-        cells = np.arange(n, dtype=np.int32)
-        at_points = compiled_expression(made, points, particles.mesh.comm)
-        evaluated: Any = at_points.eval(particles.mesh, cells)
-        values: Array = evaluated.reshape(n, nq, 3, 3)
+        values: Array = _evaluated(made, particles)
     else:
         with agree(particles.mesh.comm):
             values = _at_points(value, particles)
@@ -176,11 +320,8 @@ def _at_points(value: Any, particles: Particles) -> Array:
     if isinstance(value, _Geostatic):
         value.require_for(particles.mesh.geometry.dim)
     if callable(value):
-        x = np.zeros((3, n * nq))
-        points = particles.initial_points
-        x[: points.shape[-1]] = points.reshape(n * nq, points.shape[-1]).T
         try:
-            found = as_reals(value(x))
+            found = as_reals(value(_coordinates(particles)))
         except MPMError:
             raise
         except Exception as error:

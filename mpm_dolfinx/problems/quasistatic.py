@@ -29,7 +29,7 @@ from ..particles.particles import Particles
 from ..system.term import Term
 from .arguments import as_bodies, as_supports, as_terms, require_no_conditions_on_bodies
 from .body import INITIAL, Body, as_given
-from .initial_stress import initial_stress_at_points
+from .initial_stress import initial_stress_at_points, warn_of_other_ground
 from .parts import Contribution
 from .physics import MaterialBodies, Physics, damages
 from .problem import Law, Problem
@@ -123,6 +123,7 @@ class QuasiStaticProblem(Problem):
             spaces=self._physics.field_spaces,
         )
         self._carry_stress([body.initial_stress for body in given])
+        warn_of_other_ground(given, given)
         for body in particles:
             _warn_of_hourglass(body)
 
@@ -538,5 +539,4 @@ def _warn_of_hourglass(particles: Particles) -> None:
             f"The domains have {'one' if points == 1 else points} quadrature point"
             f"{'s'[: points > 1]} each and are about as large as the cells of the background, so "
             f"motions without strain (hourglass) meet no resistance; {cure}.",
-            stacklevel=4,
         )

@@ -25,7 +25,7 @@ from ..reals import as_wholes
 from ..system.term import Term
 from .arguments import as_bodies, as_conditions, as_terms
 from .body import Body
-from .initial_stress import initial_stress_at_points
+from .initial_stress import initial_stress_at_points, warn_of_other_ground
 from .setup import Setup
 from .staging import Change
 from .state import Stateful
@@ -183,6 +183,7 @@ class Addition(_OfSetup):
         if stress is not None:
             body, points = self._given.particles, self.problem.built.points[-1]
             begin_with_stress(points, initial_stress_at_points(stress, body))
+            warn_of_other_ground([self._given], self.problem.setup.given)
 
     @override
     def renews(self, body: int | None, name: str) -> bool:

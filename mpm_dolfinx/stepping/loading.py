@@ -137,7 +137,7 @@ class Stepper:
                         if not may_stop(owner.bodies):
                             raise
                         owner.history.stopped = told
-                        warn(comm, f"The run stopped. {told!s}", 3)
+                        warn(comm, f"The run stopped. {told!s}")
                         return
                     if step is not None:
                         self._end_step(repartition)
@@ -152,10 +152,10 @@ class Stepper:
                         )
             trial.run = None
             if (sentence := left_outside(owner.bodies, owner.history)) is not None:
-                warn(comm, sentence, 3)
+                warn(comm, sentence)
             if adaptivity is not None and (found := owner.history.steps[-1].error) is not None:
                 if (sentence := adaptivity.complaint(found)) is not None:
-                    warn(comm, sentence, 3)
+                    warn(comm, sentence)
             if interrupted(comm, last.left):
                 self._leave()
         if hold.left:
@@ -270,7 +270,6 @@ class Stepper:
             "in this step and goes to 1 by itself, as the loads had not been applied in full "
             "before this run. Set particles.load.value = 1 in update= if it says all of the loads, "
             "or apply the others by solve() first.",
-            3,
         )
 
     def _goes_on_after(self, error: MPMError, run: Run, end: float) -> bool:
@@ -404,7 +403,7 @@ class Stepper:
             tried = run.size
             if not control.reject():
                 if (sentence := control.complaint) is not None:
-                    warn(comm, sentence, 3)
+                    warn(comm, sentence)
                 return False
             trial.take_back(
                 tried, end, f"its error was estimated {ratio:.3g} times the allowed one"

@@ -210,7 +210,7 @@ class Trial:
         taken = [recorder.solved(self) for recorder in self.recorders]
         if control is not None:
             if not goal.again and (sentence := solver.jump(size, parameter)) is not None:
-                warn(comm, sentence, 3)
+                warn(comm, sentence)
             parameter = float(owner.bodies[0].load.value)
         force = solver.size_of_forces() if owner.at_rest else None
         try:

@@ -227,5 +227,4 @@ class Damage(FieldEquation):
             f"A crack runs through cells of {ratio:.2g} times the length over which it is smeared; "
             "they must be smaller than half of it. It takes "
             f"{1.0 + self._share * ratio:.2f} times the toughness there, and follows the mesh.",
-            stacklevel=4,
         )

@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Bodies that carry a stress before they move: the K0 procedure and what a user may give."""
 
+import warnings
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from compare import outcome, same_run
@@ -368,3 +371,115 @@ def test_ground_that_is_rebased_goes_on_as_ground_that_is_not(water, mpi_tmp_pat
     for each in (problem, other):
         assert each.history.iterations == straight.history.iterations
         same_run(outcome(each), outcome(straight), 1e-9)
+
+
+def told(**of_ground):
+    """Return ground of which geostatic is told something, by name, that may be wrong."""
+    return mpm.geostatic(
+        of_ground.pop("surface", HEIGHT),
+        of_ground.pop("density", DENSITY),
+        0.5,
+        of_ground.pop("gravity", GRAVITY),
+        **of_ground,
+    )
+
+
+TABLE = mpm.WaterTable(4.0, 10.0)
+AS_IT_IS = {
+    "plain": ({}, {}),
+    "layers": (
+        {"density": [(2.0, 1.5), (3.0, 2.5)]},
+        {"density": lambda m: ufl.conditional(ufl.gt(ufl.SpatialCoordinate(m)[1], 3.0), 1.5, 2.5)},
+    ),
+    "water": ({"water": TABLE}, {"pore_pressure": TABLE}),
+    "water above": (
+        {"water": mpm.WaterTable(7.0, 10.0)},
+        {"pore_pressure": mpm.WaterTable(7.0, 10.0)},
+    ),
+    "water in UFL": (
+        {"water": TABLE},
+        {"pore_pressure": lambda m: 3.0 * (4.0 - ufl.SpatialCoordinate(m)[1])},
+    ),
+    "water that slopes": (
+        {"water": mpm.WaterTable([(0.0, 2.0), (4.0, 4.0)], 10.0)},
+        {"pore_pressure": mpm.WaterTable([(0.0, 2.0), (4.0, 4.0)], 10.0)},
+    ),
+    "no water in it": ({}, {"pore_pressure": mpm.WaterTable(-1.0, 10.0)}),
+    "a Function": (
+        {"density": 1.0},
+        {"density": lambda m: 0.0 * ufl.SpatialCoordinate(m)[0] + 1.0},
+    ),
+    "a part": ({"surface": 9.0}, {"load": (0.0, -80.0)}),
+    "surcharge": ({"surcharge": 30.0}, {"load": (0.0, -30.0)}),
+    "a function that is meant": ({}, {"initial_stress": lambda x: told(density=9.0)(x)}),
+}
+OTHER = {
+    "density": ({"density": 1.1 * DENSITY}, {}, r"a density .* of \(0, -20\), .* of \(0, -22\)"),
+    "no weight": ({}, {"body_force": None}, r"of \(0, 0\), and mpm.geostatic of \(0, -20\)"),
+    "size of gravity": ({"gravity": (0.0, -9.81)}, {}, r"of \(0, -19.62\)"),
+    "upwards": ({"gravity": (0.0, 10.0), "surface": 0.0}, {}, r"of \(0, 20\)"),
+    "aside": ({}, {"body_force": (1.0, -10.0)}, r"of \(2, -20\)"),
+    "a layer": ({"density": [(2.0, 1.9), (3.0, 2.0)]}, {}, r"of \(0, -19\)"),
+    "too low": ({"surface": 4.5}, {}, r"at \(.*4.75\) .*geostatic of \(0, 0\)"),
+    "too high": ({"surface": 5.5}, {}, "on its top at 5, .* surface at 5.5, .* stress of 10"),
+    "surcharge": ({"surcharge": 5.0}, {}, "nothing acts on its top"),
+    "water in geostatic": ({"water": TABLE}, {}, "a pore_pressure of 0, and mpm.geostatic of 3"),
+    "water in the body": ({}, {"pore_pressure": TABLE}, "a pore_pressure of 37.5, .* of 0;"),
+    "other water": (
+        {"water": TABLE},
+        {"pore_pressure": mpm.WaterTable(3.5, 10.0)},
+        r"pore_pressure of [\d.]+, and",
+    ),
+}
+
+
+def body_of(geostatic, given, slope=0.0, problem=mpm.QuasiStaticProblem):
+    """Make a problem of ground, whose surface may slope, and what geostatic is told of it."""
+    V = vectors(box([0, 0], [4, 6], [4, 6], QUADRILATERAL))
+    mesh = box([0, 0], [4, HEIGHT], [8, 10], QUADRILATERAL)
+    mesh.geometry.x[:, 1] *= 1 - slope * mesh.geometry.x[:, 0]
+    given = {"density": DENSITY, "body_force": GRAVITY, "initial_stress": told(**geostatic)} | given
+    if "load" in given:
+        given["tractions"] = [(given.pop("load"), 1)]
+        given["facet_tags"] = facet_tags(mesh, at(1, HEIGHT))
+    body = mpm.Body(mpm.Particles(mesh, V), LAWS[0], **given)
+    return problem(body, bcs=[fix(V, at(0, 0, 4), component=0), fix(V, at(1, 0), component=1)])
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.1])
+@pytest.mark.parametrize(("geostatic", "given"), AS_IT_IS.values(), ids=AS_IT_IS.keys())
+def test_geostatic_that_was_told_of_the_body_as_it_is_warns_of_nothing(geostatic, given, slope):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        body_of(geostatic, given, 0.0 if "load" in given else slope)
+
+
+@pytest.mark.parametrize("problem", [mpm.QuasiStaticProblem, mpm.DynamicProblem])
+@pytest.mark.parametrize(("geostatic", "given", "words"), OTHER.values(), ids=OTHER.keys())
+def test_geostatic_that_was_told_of_other_ground_says_what_differs(
+    geostatic, given, words, problem
+):
+    expected = pytest.warns(UserWarning, match=words) if WORLD.rank == 0 else nullcontext([])
+    with expected as found:
+        body_of(geostatic, given, problem=problem)
+    assert all(warning.filename == __file__ for warning in found)  # the user's line
+
+
+def test_the_top_of_ground_is_that_of_all_bodies_and_one_that_is_added_is_looked_at():
+    V = vectors(box([0, 0], [4, 6], [4, 6], QUADRILATERAL))
+    low = mpm.Particles(box([0, 0], [4, 3], [8, 6], QUADRILATERAL), V)
+    high = mpm.Particles(box([0, 3], [4, HEIGHT], [8, 4], QUADRILATERAL), V)
+    same = {"material": LAWS[0], "density": DENSITY, "body_force": GRAVITY}
+    stress, heavier = told(), told(density=2.5 * DENSITY)
+    sides = [fix(V, at(0, 0, 4), component=0), fix(V, at(1, 0), component=1)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        bodies = [mpm.Body(one, initial_stress=stress, **same) for one in (low, high)]
+        mpm.QuasiStaticProblem(bodies, bcs=sides).solve()
+        assert max(largest(one.displacement.x.array) for one in (low, high)) < 1e-12
+    low = mpm.Particles(low.mesh, V)
+    with pytest.warns(UserWarning, match="on its top at 3") if WORLD.rank == 0 else nullcontext():
+        problem = mpm.QuasiStaticProblem(mpm.Body(low, initial_stress=stress, **same), bcs=sides)
+    high = mpm.Particles(high.mesh, V)
+    with pytest.warns(UserWarning, match=r"\(0, -50\)") if WORLD.rank == 0 else nullcontext():
+        problem.add(mpm.Body(high, initial_stress=heavier, **same))
