@@ -4,14 +4,16 @@
 
 import contextlib
 import fcntl
+import functools
 import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 from ffcx.codegeneration import jit
 
@@ -33,53 +35,44 @@ def run(*arguments, cwd=None, **environment):
     )
 
 
-#: Where DOLFINx keeps compiled forms, and where tests do: others' that were killed meanwhile leave
-#: files for which FFCx waits.
-CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-USUAL, OWN = CACHE / "fenics", CACHE / "mpm_dolfinx_tests"
+#: Where tests keep compiled forms, apart from DOLFINx: others' that were killed meanwhile leave files
+#: for which FFCx waits.
+OWN = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_dolfinx_tests"
 #: The end of the name of FFCx's note that a module is ready.
 READY = ".c.cached"
 
 
 @contextlib.contextmanager
-def whole_forms(usual: Path = USUAL, own: Path = OWN) -> Iterator[None]:
+def whole_forms(own: Path = OWN) -> Iterator[None]:
     """Keep the forms of tests, without those that a run was killed at; one rank does this.
 
     Who runs tests holds a lock, which ends with his process. Where nobody else does, forms that are
-    begun only are taken away, and those that are ready in the usual cache need not be compiled.
+    begun only are taken away.
     """
     own.mkdir(parents=True, exist_ok=True)
     with (own / "lock").open("a") as lock:
         with contextlib.suppress(BlockingIOError):
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            for module in {file.stem for file in own.glob("*.c")} - _ready(own):
+            ready = {note.name.removesuffix(READY) for note in own.glob(f"*{READY}")}
+            for module in {file.stem for file in own.glob("*.c")} - ready:
                 for file in own.glob(f"{module}.*"):
                     file.unlink()
-            for module in _ready(usual) - _ready(own):
-                note = f"{module}{READY}"
-                for file in usual.glob(f"{module}.*"):
-                    if file.name != note:
-                        shutil.copy2(file, own)
-                shutil.copy2(usual / note, own)
         fcntl.flock(lock, fcntl.LOCK_SH)
         yield
 
 
-def _ready(cache: Path) -> set[str]:
-    """Return the names of the modules that FFCx has compiled."""
-    return {note.name.removesuffix(READY) for note in cache.glob(f"*{READY}")}
-
-
 @contextlib.contextmanager
 def patient_compilers() -> Iterator[None]:
-    """Have DOLFINx wait for a form that another process compiles, here and in what is started.
+    """Have forms compiled fast, and waited for where another process does, also in what is started.
 
-    Its ten seconds are short for several processes with an empty cache on a busy machine. The
+    DOLFINx's ten seconds are short for several processes with an empty cache on a busy machine.
+    Most forms of tests are made of few cells: what compilers optimise takes longer than it wins. The
     options are read from a file, to which what the user's own file says is added.
     """
     own = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     name = Path("dolfinx", "dolfinx_jit_options.json")
-    options = {"timeout": int(PATIENCE)}
+    options: dict[str, Any] = {"timeout": int(PATIENCE)}
+    options["cffi_extra_compile_args"] = ["-O0", "-g0"]
     with contextlib.suppress(OSError):
         options |= json.loads((own / name).read_text("utf-8"))
     options["cache_dir"] = str(OWN)
@@ -99,8 +92,11 @@ def patient_compilers() -> Iterator[None]:
 
 @contextlib.contextmanager
 def remembered_forms() -> Iterator[None]:
-    """Have FFCx look for a form once: for each that is made again it lists its whole cache."""
-    look, found = jit.get_cached_module, {}
+    """Have FFCx look for a form once, where it lists its whole cache for each that is made again.
+
+    And setuptools for what is installed once, where it looks seven times for each that is compiled.
+    """
+    look, found, installed = jit.get_cached_module, {}, metadata.entry_points
 
     def remember(module_name, object_names, cache_dir, timeout):
         key = module_name, tuple(object_names), str(cache_dir)
@@ -111,8 +107,8 @@ def remembered_forms() -> Iterator[None]:
             found[key] = objects, module
         return found[key]
 
-    jit.get_cached_module = remember
+    jit.get_cached_module, metadata.entry_points = remember, functools.cache(installed)
     try:
         yield
     finally:
-        jit.get_cached_module = look
+        jit.get_cached_module, metadata.entry_points = look, installed

@@ -66,20 +66,14 @@ def test_other_errors_of_compilation_are_told_as_they_are(mpi_tmp_path):
 
 @pytest.mark.skip_in_parallel
 def test_the_cache_of_tests_has_whole_forms_alone(tmp_path):
-    usual, own = tmp_path / "usual", tmp_path / "own"
-    for cache, names in ((usual, ("a", "b")), (own, ("b", "c"))):
-        cache.mkdir()
-        for name in names:
-            (cache / f"{name}.c").touch()
-    (usual / "a.so").touch()
-    (usual / f"a{programs.READY}").touch()
-    (own / f"b{programs.READY}").touch()
-    with programs.whole_forms(usual, own):
-        kept = {"a.c", "a.so", "a.c.cached", "b.c", "b.c.cached", "lock"}
-        assert {file.name for file in own.iterdir()} == kept
-        (own / "d.c").touch()  # which this run compiles now
-        with programs.whole_forms(usual, own):
-            assert (own / "d.c").exists()
+    for name in ("a.c", "a.so", f"a{programs.READY}", "b.c"):
+        (tmp_path / name).touch()
+    with programs.whole_forms(tmp_path):
+        kept = {"a.c", "a.so", "a.c.cached", "lock"}
+        assert {file.name for file in tmp_path.iterdir()} == kept
+        (tmp_path / "c.c").touch()  # which this run compiles now
+        with programs.whole_forms(tmp_path):
+            assert (tmp_path / "c.c").exists()
 
 
 def test_all_forms_are_compiled_there():
