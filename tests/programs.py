@@ -35,8 +35,8 @@ def run(*arguments, cwd=None, **environment):
     )
 
 
-#: Where tests keep compiled forms, apart from DOLFINx: others' that were killed meanwhile leave files
-#: for which FFCx waits.
+#: Where tests keep compiled forms, apart from DOLFINx, where others that were killed meanwhile
+#: leave files for which FFCx waits.
 OWN = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_dolfinx_tests"
 #: The end of the name of FFCx's note that a module is ready.
 READY = ".c.cached"
@@ -66,7 +66,7 @@ def patient_compilers() -> Iterator[None]:
     """Have forms compiled fast, and waited for where another process does, also in what is started.
 
     DOLFINx's ten seconds are short for several processes with an empty cache on a busy machine.
-    Most forms of tests are made of few cells: what compilers optimise takes longer than it wins. The
+    Meshes of tests have few cells: to optimise forms takes compilers longer than it wins. The
     options are read from a file, to which what the user's own file says is added.
     """
     own = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
