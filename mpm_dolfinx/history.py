@@ -146,6 +146,9 @@ class Step:
         error: What :meth:`Problem.error` found at its end, ``None`` where it was not asked.
         alternations: How often equations of fields were solved in turn with the displacements.
         freed: How many nodes were freed at its end (``adapt=``), after which it was solved on.
+        time_error: Of a motion, the estimated error of its displacements by its duration, the root
+            mean square over the nodes; ``None`` in the first steps, which have too few before them.
+        motion: Of a motion, how far the nodes have come at its end, likewise.
     """
 
     load: float
@@ -157,6 +160,8 @@ class Step:
     error: float | None = None
     alternations: int = 0
     freed: int = 0
+    time_error: float | None = None
+    motion: float | None = None
 
 
 @dataclass(frozen=True)
@@ -321,6 +326,19 @@ class History:
     def stage(self) -> float:
         """Number of the stages so far, those that ended early too: the time when one begins."""
         return float(math.ceil(self.time))
+
+    @property
+    def time_error(self) -> float | None:
+        """Estimated error of a motion by the duration of its steps, over how far it has gone.
+
+        The sum of what is known of the steps; those before the first of which an error is known
+        count like it. ``None`` where none is, or nothing has moved.
+        """
+        known = [step.time_error for step in self.steps if step.time_error is not None]
+        moved = max((step.motion or 0.0 for step in self.steps), default=0.0)
+        if not known or moved == 0.0:
+            return None
+        return (sum(known) + (len(self.steps) - len(known)) * known[0]) / moved
 
     @property
     def total_iterations(self) -> int:

@@ -362,6 +362,7 @@ class Past(Kept):
                 [
                     *(s.load, s.iterations, s.residuals, s.displacement),
                     *(s.time, s.output, s.error, s.alternations, s.freed),
+                    *(s.time_error, s.motion),
                 ]
                 for s in history.steps
             ],

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, override
 
 from petsc4py import PETSc
@@ -20,12 +21,14 @@ from dolfinx import fem
 from .. import _compat
 from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
-from ..errors import MPMError, agree, as_ours
+from ..errors import MPMError, agree, as_ours, warn
 from ..history import Energy
 from ..parallel.compilation import compiled_expression
 from ..particles.particles import Particles
 from ..reals import as_finite, as_reals
+from ..stepping.automatic import local_error
 from ..system.inertia import Inertia
+from ..system.schemes import order_of
 from ..system.term import Term
 from .arguments import as_bodies
 from .through_time import TimeProblem
@@ -37,6 +40,9 @@ __all__ = [
     "rayleigh_of",
     "require_motion",
 ]
+
+#: Error of the time steps, over the motion, from which on a run that ends says so.
+UNCERTAIN = 0.05
 
 
 class MovingProblem(TimeProblem):
@@ -57,6 +63,7 @@ class MovingProblem(TimeProblem):
         self._pace = self.inertia.dt, self.inertia.scheme.share
         super().build()
         self.trial.newton.lets_go = True
+        self.reduced.predictor.clear(measures=True)
         others = [term for term in self.terms if term is not self.inertia]
         self.inertia.follow(self, [*self.built.body_terms, *others])
 
@@ -72,6 +79,18 @@ class MovingProblem(TimeProblem):
         masses = self.built.mass_matrices(number)
         masses[self.bodies[number].deleted] = 0.0
         return masses
+
+    @cached_property
+    def _order(self) -> tuple[int, float]:
+        """Order and constant of the scheme (collective)."""
+        return order_of(self._comm, self.inertia.scheme)
+
+    @override
+    def time_error(self, size: float) -> tuple[float | None, float | None]:
+        order, constant = self._order
+        known = len(self.reduced.predictor.past) >= order
+        error, motion = local_error(self.reduced, size, self._comm, order, constant)
+        return error if known else None, motion
 
     # -- What steps begin with ----------------------------------------------------------------
 
@@ -174,6 +193,23 @@ class MovingProblem(TimeProblem):
         self.inertia.begin_run(now)
         for recorder in self.trial.recorders:
             recorder.begins()
+
+    _told_of_steps = False
+
+    @override
+    def _end_run(self) -> None:
+        """Say so, once, where steps are too long for the motion."""
+        error = self.history.time_error
+        if self._told_of_steps or error is None or error <= UNCERTAIN:
+            return
+        self._told_of_steps = True
+        times = [energy.time for energy in self._energies]
+        longest = float(np.diff(times).max())
+        warn(
+            self._comm,
+            f"Time steps of {longest:.3g} are too coarse: their error is estimated to be "
+            f"{100.0 * error:.2g} % of the motion; take dt <= {longest * UNCERTAIN / error:.2g}.",
+        )
 
     @override
     def _resume_run(self) -> None:

@@ -687,6 +687,16 @@ class Problem(Hooked, OwnNames):
         """
         return None
 
+    def time_error(self, size: float) -> tuple[float | None, float | None]:
+        """Return the error of a solved step by its duration, and the motion so far (collective).
+
+        Root mean squares over the nodes; ``None``: not known.
+
+        Args:
+            size: The duration.
+        """
+        return None, None
+
     def begin_step(self) -> None:
         """Look at what may have changed since the last step (collective).
 

@@ -148,7 +148,7 @@ class Staging:
                 return belongs(name, gone) or change.renews(body, name)
 
             found = merged(snapshot, state.capture(), numbers, backgrounds, renewed)
-            nothing: dict[str, object] = {"past": [], "supports": None, "force": None}
+            nothing = {"past": [], "past moved": False, "supports": None, "force": None}
             found.numbers.update({**nothing, "release remaining": 0.0})
             return found
 

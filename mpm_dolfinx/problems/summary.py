@@ -129,6 +129,8 @@ def _run(history: History) -> str:
         free = int(history.statistics["free_dofs"])
         parts.append(f"{free} free dofs in the last step")
         parts.append(f"{int(history.statistics['factorisations'])} factorisations")
+    if (error := history.time_error) is not None:
+        parts.append(f"its steps in time leave about {100.0 * error:.2g} % of the motion uncertain")
     if history.losses:
         parts.append(f"{sum(len(loss.particles) for loss in history.losses)} particles lost")
     if history.stopped is not None:

@@ -38,6 +38,9 @@ class TimeProblem(Problem):
     def _resume_run(self) -> None:
         """Take notice that a run goes on from a checkpoint (collective)."""
 
+    def _end_run(self) -> None:
+        """Look back at a run that has come to its end (collective)."""
+
     @collective()
     def solve(  # type: ignore[override]
         self,
@@ -172,6 +175,7 @@ class TimeProblem(Problem):
             if self.history.time != end:
                 return
             now = end
+        self._end_run()
 
     def _apply_loads(self) -> None:
         """Apply loads in full, and supports as they are given."""

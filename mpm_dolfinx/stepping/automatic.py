@@ -17,11 +17,12 @@ from ..errors import MPMError
 from ..parallel.magnitudes import joint_norm
 from ..particles.particles import Particles
 from ..reals import as_reals
+from ..system.predictor import extrapolated
 from ..system.reduced import ReducedSystem
 from ..tolerances import EQUAL, NEGLIGIBLE, SLIGHT
 from .control import LIMIT_HALVINGS, MOST_HALVINGS, Control, StepControl
 
-__all__ = ["ErrorControl", "StepError", "control_of", "error_of_step"]
+__all__ = ["ErrorControl", "StepError", "control_of", "error_of_step", "local_error"]
 
 #: The first step: a larger one that walks from the elastic range into flow leaves an error that
 #: nothing repairs.
@@ -66,34 +67,59 @@ class StepError:
 def error_of_step(reduced: ReducedSystem, size: float, comm: MPI.Comm) -> StepError:
     """Estimate the error of the step that was solved last, in displacements (collective).
 
-    The second difference ``D^2 / (D + D') |u / D - u' / D'|`` of its increment u and that of the
-    step before, of sizes D and D'; half of the increment in the first step.
+    That of :func:`local_error` by a rule of first order, as backward Euler's; half of the increment
+    in the first step.
 
     Args:
         reduced: The system, its last residual that of the solution.
         size: Size of the step.
         comm: The ranks.
     """
+    error, motion = local_error(reduced, size, comm)
+    smooth = reduced.terms.smooth()
+    touches = not smooth and reduced.terms.one_sided
+    return StepError(error, motion, smooth, touches, touches and reduced.terms.is_driven())
+
+
+def local_error(
+    reduced: ReducedSystem, size: float, comm: MPI.Comm, order: int = 1, constant: float = 0.5
+) -> tuple[float, float]:
+    """Return the error that a rule makes in the step that was solved last, and the motion so far.
+
+    A rule of order p errs by ``C D^(p + 1) |d^(p + 1) u|`` in a step of size D. The derivative is
+    what the increment differs by from that which the last p steps let expect, over the same of a
+    polynomial. Where the motion is not smooth, as in an impact, it grows as D does not. In the
+    first p steps it is a share C of the increment.
+
+    Args:
+        reduced: The system, its last residual that of the solution.
+        size: Size of the step.
+        comm: The ranks.
+        order: The order p, 1 or 2.
+        constant: The constant C.
+
+    Returns:
+        Root mean squares over the nodes of all bodies.
+    """
     past = reduced.predictor
     bodies = [i for i, moved in enumerate(reduced.bodies) if isinstance(moved, Particles)]
     every = reduced.unknowns.increments()
     increments = [every[i] for i in bodies]
-    error = [0.5 * u for u in increments]
-    if past.past:
-        last, before = past.past[-1]
-        weight = size / (size + last)
-        error = [
-            weight * (u - size / last * before[i]) for i, u in zip(bodies, increments, strict=True)
-        ]
-    moved = increments
+    error, moved = increments, increments
+    steps = past.past[-order:]
+    if len(steps) == order:
+        expected = extrapolated(steps, size)
+        error = [u - expected[i] for i, u in zip(bodies, increments, strict=True)]
+        before = 0.0
+        for number, (last, _) in enumerate(reversed(steps), 1):
+            constant *= 2.0 * number * size / (size + 2.0 * before + last)
+            before += last
     if past.moved:
         moved = [past.moved[i] + u for i, u in zip(bodies, increments, strict=True)]
     gdim = reduced.bodies[bodies[0]].W.mesh.geometry.dim
     nodes = comm.allreduce(sum(len(u) for u in increments)) / gdim
-    rms = [joint_norm(np.concatenate(values), comm) / math.sqrt(nodes) for values in (error, moved)]
-    smooth = reduced.terms.smooth()
-    touches = not smooth and reduced.terms.one_sided
-    return StepError(rms[0], rms[1], smooth, touches, touches and reduced.terms.is_driven())
+    sizes = [joint_norm(np.concatenate(own), comm) / math.sqrt(nodes) for own in (error, moved)]
+    return constant * sizes[0], sizes[1]
 
 
 class ErrorControl:

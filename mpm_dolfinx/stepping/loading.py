@@ -192,7 +192,8 @@ class Stepper:
         if start == goal:
             raise MPMError("The controlled displacement has its value already.")
         self._begins_stage = False
-        trial.reduced.predictor.clear(isinstance(steps, ErrorControl))
+        if span is None:
+            trial.reduced.predictor.clear(isinstance(steps, ErrorControl))
         base = [values.copy() for values in trial.converged.prescribed]
         left = self._release.remaining
         trial.run = Run(steps, update is not None, start, base, goal, began, end, left)

@@ -54,6 +54,9 @@ class Owner(Protocol):
     def repartition(self, threshold: float) -> bool:
         """Move particles to where they are best now; return whether any have moved."""
 
+    def time_error(self, size: float) -> tuple[float | None, float | None]:
+        """Return the error of a solved step by its duration, and the motion so far, if known."""
+
 
 class Recorder(Protocol):
     """Follows the steps that a problem makes. All calls are collective."""
@@ -207,6 +210,7 @@ class Trial:
         if rejects is not None and rejects(size):
             self.newton.experience = experience
             return None
+        error, motion = owner.time_error(size)
         taken = [recorder.solved(self) for recorder in self.recorders]
         if control is not None:
             if not goal.again and (sentence := solver.jump(size, parameter)) is not None:
@@ -237,6 +241,8 @@ class Trial:
             goal.time,
             goal.output,
             alternations=turns,
+            time_error=error,
+            motion=motion,
         )
         history.steps.append(step)
         where = step.time if step.displacement is None else step.displacement

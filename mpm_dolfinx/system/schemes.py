@@ -14,6 +14,7 @@ what was kept. No acceleration needs to be kept: what the cells cannot follow wo
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,10 +30,11 @@ from ..errors import MPMError
 from ..parallel.boundary import Hooked
 from ..parallel.given import is_number, require_same, require_truth
 from ..reals import is_one_of
+from ..tolerances import EQUAL
 from .mass import NodalMass
 
 __all__ = ["OUT_OF_RANGE", "SCHEMES", "Conserving", "Euler", "Kinematics", "Midpoint", "Rates"]
-__all__ += ["Scheme", "as_scheme", "rates_of"]
+__all__ += ["Scheme", "as_scheme", "order_of", "rates_of"]
 
 OUT_OF_RANGE = ("project", "reflect")
 
@@ -251,6 +253,38 @@ def rates_of(comm: MPI.Comm, scheme: Scheme, dt: float, last: float) -> Rates:
         )
     require_same(comm, rates=rows)
     return found
+
+
+def order_of(comm: MPI.Comm, scheme: Scheme) -> tuple[int, float]:
+    """Return the order p of a scheme, and C of the error ``C dt^(p + 1)`` that a step makes.
+
+    They are those of equal steps of an oscillation ``exp(i t)`` without damping, which the scheme
+    multiplies in a step by the eigenvalue next to ``exp(i dt)``. No more than two counts.
+
+    Args:
+        comm: The ranks.
+        scheme: The scheme.
+
+    Raises:
+        MPMError: Its rates are none.
+    """
+    errors = (_error_of_oscillation(scheme, dt, comm) for dt in (0.02, 0.01))
+    long, short = (max(error, EQUAL) for error in errors)
+    order = min(max(round(math.log2(long / short)) - 1, 1), 2)
+    return order, short / 0.01 ** (order + 1)
+
+
+def _error_of_oscillation(scheme: Scheme, dt: float, comm: MPI.Comm) -> float:
+    """Return what a step makes wrong of an oscillation of the size and frequency 1."""
+    rates = rates_of(comm, scheme, dt, dt)
+    increment = np.zeros(2 + len(scheme.keeps))  # by displacement, velocity and what is kept
+    increment[0], increment[1:] = -1.0, -rates.acceleration[1:]
+    increment /= rates.acceleration[0] + scheme.share
+    rows = np.array([rates.velocity, *rates.kept])
+    step = np.outer([1.0, *rows[:, 0]], increment)
+    step[0, 0] += 1.0
+    step[1:, 1:] += rows[:, 1:]
+    return float(np.abs(np.linalg.eigvals(step) - np.exp(1j * dt)).min())
 
 
 def _difference(some: Sequence[PETSc.Vec], others: Sequence[PETSc.Vec]) -> list[PETSc.Vec]:
