@@ -22,9 +22,6 @@ from .surface import Surface
 
 __all__ = ["OPPOSITE", "goes_through", "passes"]
 
-#: Least length of a way through an obstacle, over the thickness of the domain behind: less is cut
-#: off a sharp corner.
-CUT = 0.02
 #: Least cosine between a way and the normal of a surface that it goes through.
 STEEP = 0.1
 #: Product of two normals below which they are those of opposite sides, for a point that touches
@@ -99,7 +96,7 @@ def goes_through(
     through = (enters * leaves).sum(axis=1) < np.where(free, OPPOSITE_FREE, OPPOSITE)
     through &= -(enters * way).sum(axis=1) > STEEP * size
     through &= (leaves * way).sum(axis=1) > STEEP * size
-    through &= (1.0 - first - last) * size > CUT * thickness[which]
+    through &= (1.0 - first - last) * size > on[which]
     return bool(through.any())
 
 

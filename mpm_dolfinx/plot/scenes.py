@@ -35,8 +35,6 @@ __all__ = ["Shot", "draw", "framed", "new_figure", "scene", "take"]
 #: Room around the bodies, relative to their extent; size of a background over theirs up to which it
 #: is shown whole; pixels of the longer side in space.
 MARGIN, NEARBY, PIXELS = 0.04, 2.0, 1500
-#: Height over width of what is shown, below which the colour bar lies beneath it.
-FLAT = 0.4
 #: Colour of obstacles.
 OBSTACLE = "#b9b2a6"
 #: Colour of structures without a field, and their width in points and in pixels of space. In
@@ -284,7 +282,7 @@ def new_figure(figures: Any, shot: Shot, look: Look) -> Any:
         wide, high = np.abs(right) @ (box[1] - box[0]), np.abs(up) @ (box[1] - box[0])
     else:
         wide, high = np.maximum(box[1] - box[0], 1e-12)
-    height = np.clip(8.0 * high / wide + (1.6 if high < FLAT * wide else 0.4), 2.4, 8.6)
+    height = np.clip(8.0 * high / wide + (1.6 if high < wide else 0.4), 2.4, 8.6)
     return figures.Figure(figsize=(8.0, float(height)), layout="compressed")
 
 
@@ -315,7 +313,7 @@ def draw(shot: Shot, look: Look, ax: Any, bar: bool = True) -> Any:
     if look.title is not None:
         ax.set_title(look.title)
     if coloured and bar:
-        flat = np.ptp(ax.get_ylim()) < FLAT * np.ptp(ax.get_xlim())
+        flat = np.ptp(ax.get_ylim()) < np.ptp(ax.get_xlim())
         place = {"orientation": "horizontal", "shrink": 0.6} if flat else {"shrink": 0.8}
         colorbar = ax.figure.colorbar(artist, ax=ax, label=look.label, aspect=28, **place)
         colorbar.outline.set_linewidth(0.4)

@@ -34,10 +34,8 @@ from .state import ProblemState
 
 __all__ = ["Remeshable", "Remeshing", "as_indices"]
 
-#: How often a failing step may be mended, and the share of all quadrilaterals that is split at
-#: first where none is named.
+#: How often a failing step may be mended: the last time, half of all quadrilaterals are split.
 TRIES = 5
-FEW = 0.02
 
 
 class Remeshable(Staged, Protocol):
@@ -117,7 +115,7 @@ class Remeshing:
             if several or tries > 1 or not comm.allreduce(int(which.sum())):
                 shape = body.domain_distortion()
                 every = np.sort(np.concatenate(comm.allgather(shape[whole])))
-                few = int(np.ceil(FEW * 2 ** (tries - 1) * len(every)))
+                few = int(np.ceil(0.5 ** (TRIES + 1 - tries) * len(every)))
                 worst = whole & (shape <= (every[few - 1] if few else -np.inf))
                 which = worst if several else which | worst
             chosen.append(body.global_index[which])

@@ -10,17 +10,11 @@ import numpy as np
 
 from ..errors import ConvergenceError, MPMError
 from ..parallel.magnitudes import norm
-from ..tolerances import LOCAL_ITERATIONS
+from ..tolerances import LOCAL_ITERATIONS, SMALL
 from .linear import ShiftedFactor
 from .problem import Levels, Resisting
 
 __all__ = ["mechanism", "not_held"]
-
-#: Stiffness along a motion, relative to that of its unknowns one by one and to the shift, up to
-#: which nothing holds it.
-MECHANISM = 1e-5
-#: The same of values that are no displacements, whose stiffness is known to round-off alone.
-UNKNOWN = 0.1
 
 
 def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.Vec | None:
@@ -49,7 +43,7 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
             ratio = abs(system.stiffness(mode)) / mode.dot(force)
         else:
             ratio = system.stiffness(mode) / mode.dot(force)
-        if ratio <= MECHANISM or (ratio <= UNKNOWN and system.field_of(mode) is not None):
+        if ratio <= SMALL:
             return mode
         if ratio > 0.95 * before:
             return None
@@ -96,7 +90,7 @@ def _all_move_rigidly(system: Resisting, levels: Levels, factor: ShiftedFactor) 
     motion.set(0.0)
     motion.maxpy(softest, motions)
     resistance = motion.dot(motion * factor.D)
-    return bool(system.stiffness(motion) <= MECHANISM * resistance)
+    return bool(system.stiffness(motion) <= SMALL * resistance)
 
 
 def _unsupported(share: float) -> MPMError:

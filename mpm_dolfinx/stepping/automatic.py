@@ -27,16 +27,12 @@ __all__ = ["ErrorControl", "StepError", "control_of", "error_of_step", "local_er
 #: The first step: a larger one that walks from the elastic range into flow leaves an error that
 #: nothing repairs.
 FIRST = 0.05
-#: Share of the first step down to which it is taken back where something touches in it.
-EARLIEST = 0.25
 #: Factor to the next step, at least and at most, and share of the one that would just do.
 LEAST, MOST, SAFETY = 0.2, 2.0, 0.9
 #: Exponents of a step's error and of that of the step before, in a PI controller of order two.
 PROPORTIONAL, INTEGRAL = 0.35, 0.2
 #: Error over the allowed one from which a step is taken back.
 REJECTED = 4.0
-#: How many of the smallest steps with such an error a run takes before it says so.
-MANY = 10
 #: What the error of a step counts in which nothing yields: what is left of it in the end.
 ELASTIC = 0.02
 #: Factor of the tolerance where errors are compared with the motion so far, or with a length.
@@ -254,11 +250,11 @@ class ErrorControl:
 
         The smallest is not, and counted. Nor is the first one, as half of it counts as its error,
         however small it is; but what contact moves wrongly at first stays, so that with it the
-        first step is made small.
+        first step is made smaller, once.
         """
         tried = self.target - self._now
-        small = not self._touches or tried <= EARLIEST * FIRST
-        if self._ratio <= REJECTED or (self._before is None and small):
+        kept = self._before is None and (tried < FIRST or not self._touches)
+        if self._ratio <= REJECTED or kept:
             return False
         if self._smallest:
             self._unkept += 1
@@ -269,14 +265,14 @@ class ErrorControl:
     @property
     def complaint(self) -> str | None:
         """Warning that the step judged last misses the tolerance, given once."""
-        if self._unkept != MANY or self._ratio <= REJECTED or not self._smallest:
+        if self._unkept != 1 or self._ratio <= REJECTED or not self._smallest:
             return None
         length = "" if self._length is None else f" and length={self._length:g}"
         return (
-            f"tolerance={self._tolerance:g}{length} cannot be kept: {MANY} steps of the smallest "
-            f"size, {self._least:.3g} of the load, had errors above the allowed one (the last "
-            f"{self._ratio:.3g} times), and the run goes on with them for up to "
-            f"{math.ceil((1.0 - self._now) / self._least)} steps; give larger ones."
+            f"tolerance={self._tolerance:g}{length} cannot be kept: a step of the smallest size, "
+            f"{self._least:.3g} of the load, had {self._ratio:.3g} times the allowed error, and "
+            f"the run goes on with such steps, up to {math.ceil((1.0 - self._now) / self._least)} "
+            "of them; give larger ones."
         )
 
     def accept(self, iterations: int) -> None:

@@ -126,7 +126,7 @@ def test_a_tolerance_that_cannot_be_kept_is_told_once():
             told += [] if control.complaint is None else [(control.share, control.complaint)]
             control.accept(5)
     assert len(told) == 1 and told[0][0] < 0.1
-    assert "tolerance=0.001 cannot be kept: 10 steps" in told[0][1]
+    assert "tolerance=0.001 cannot be kept: a step of the smallest" in told[0][1]
 
 
 @pytest.mark.parametrize("options", [{"tolerance": 1e-8}, {"length": 1e-9}], ids=str)
