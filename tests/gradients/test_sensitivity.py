@@ -360,3 +360,13 @@ def test_free_nodes_are_not_followed():
     )
     with pytest.raises(mpm.MPMError, match="does not follow bodies with free nodes"):
         mpm.Sensitivity(problem, [(problem.points[0].laws.given[0], "young")])
+
+
+@pytest.mark.parametrize("who", [mpm.Sensitivity, mpm.Adjoint])
+def test_a_law_of_fracture_is_named_where_it_is_not_followed(who):
+    body = scenes.unit(2, scenes.QUADRILATERAL)
+    V = scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 1.5], [4, 4], scenes.QUADRILATERAL))
+    law = materials.Fracture(materials.Hencky(1e3, 0.3), 0.05, 0.4)
+    problem = mpm.QuasiStaticProblem(mpm.Body(mpm.Particles(body, V), law))
+    with pytest.raises(mpm.MPMError, match="does not follow a law of fracture"):
+        who(problem, [(problem.points[0].laws.given[0], "young")])
