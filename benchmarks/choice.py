@@ -235,7 +235,7 @@ QUAD = {"dim": 2, "cell": QUADRILATERAL, "body": QUADRILATERAL}
 TRI = {"dim": 2, "cell": TRIANGLE, "body": TRIANGLE}
 NEARLY = mpm.materials.VonMises(1e6, 0.49, rho_y=20e3)
 SMALL = mpm.materials.LinearElastic(1e6, 0.3)
-SAND = mpm.materials.MohrCoulomb(1e6, 0.3, 2e4, 0.5, 0.1)
+SAND = mpm.materials.MohrCoulomb(1e6, 0.3, 2e4, 30.0, 5.0)
 GMSH = {"background": partial(unstructured, 8.0, 0.4), "body": TETRAHEDRON}
 GMSH_FINE = {"background": partial(unstructured, 8.0, 0.28), "body": TETRAHEDRON}
 GMSH_2 = {"background": partial(unstructured, 8.0, 0.8), "body": TETRAHEDRON, "degree": 2}

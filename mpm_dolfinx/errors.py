@@ -40,6 +40,7 @@ __all__ = [
     "met",
     "name_particles",
     "warn",
+    "warn_alone",
 ]
 
 #: What a rank brings to a meeting besides a token.
@@ -296,16 +297,23 @@ def as_ours(error: Exception, what: str) -> MPMError:
 def warn(comm: MPI.Comm, sentence: str) -> None:
     """Warn the user on rank 0; where that is an error (``-W error``), it is on all (collective).
 
-    The warning is of the line that called this package.
-
     Args:
         comm: The ranks.
         sentence: The warning.
     """
     with agree(comm):
         if comm.rank == 0:
-            here = os.path.join(os.path.dirname(__file__), "")
-            warnings.warn(sentence, skip_file_prefixes=(here,))
+            warn_alone(sentence)
+
+
+def warn_alone(sentence: str) -> None:
+    """Warn the user, by the line that called this package, on the rank that calls this.
+
+    Args:
+        sentence: The warning.
+    """
+    here = os.path.join(os.path.dirname(__file__), "")
+    warnings.warn(sentence, skip_file_prefixes=(here,))
 
 
 def _sendable(error: BaseException) -> BaseException:

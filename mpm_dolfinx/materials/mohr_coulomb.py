@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal, Self, override
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import MPMError
+from ..errors import MPMError, warn_alone
 from .base import Field, Parameter, State, checked, exceeds
 from .mandel import to_tensor
 from .plastic import PlasticMaterial
@@ -71,7 +71,8 @@ class FrictionalMaterial(SofteningMaterial):
             young: Young's modulus, in units of stress.
             poisson: Poisson's ratio.
             cohesion: Shear strength where there is no pressure, in units of stress.
-            friction_angle: Angle of friction phi in degrees.
+            friction_angle: Angle of friction phi in degrees; below 1, as one in radians is, but not
+                0, there is a warning.
             dilation_angle: Angle of dilation psi in degrees, at most that of friction; where it
                 is the same (the same number or the same object) flow is associated and the
                 tangent symmetric.
@@ -98,6 +99,7 @@ class FrictionalMaterial(SofteningMaterial):
         numbers = isinstance(friction, float) and isinstance(dilation, float)
         self.symmetric = friction == dilation if numbers else friction_angle is dilation_angle
         _require_less_dilation(own)
+        _warn_of_units(own)
         self.volume_correction = bool(volume_correction)
 
     def with_softening(
@@ -255,6 +257,28 @@ def _require_less_dilation(parameters: Mapping[str, Parameter]) -> None:
             "dilation_angle is larger than friction_angle: plastic flow would create energy; give "
             "at most the angle of friction."
         )
+
+
+def _warn_of_units(parameters: Mapping[str, Parameter]) -> None:
+    """Warn where numbers that are given are those of another unit, or have no effect."""
+    given = {name: getattr(value, "value", value) for name, value in parameters.items()}
+    known = {n: np.asarray(v) for n, v in given.items() if isinstance(v, float | np.ndarray)}
+    friction = known.get("friction_angle", np.zeros(1))
+    steepest = friction.max(initial=0.0)
+    if 0.0 < steepest < 1.0:
+        warn_alone(
+            f"friction_angle is {steepest:g} degrees; if these are radians, give "
+            f"{np.degrees(steepest):.4g}."
+        )
+    flattest = np.radians(friction.min(initial=90.0))
+    if {"tension_cutoff", "cohesion"} <= known.keys() and flattest > 0.0:
+        least = known["tension_cutoff"].min(initial=np.inf)
+        most = known["cohesion"].max(initial=0.0) / np.tan(flattest)
+        if least > most:
+            warn_alone(
+                f"tension_cutoff={least:g} has no effect, as cohesion and friction bear a tension "
+                f"of {most:.4g} at most; give less than that, or omit it."
+            )
 
 
 class MohrCoulomb(FrictionalMaterial):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Mohr-Coulomb, Tresca and Drucker-Prager against active sets, differences and closed forms."""
 
+import warnings
 from itertools import combinations, product
 
 import numpy as np
@@ -524,6 +525,30 @@ def test_a_residual_strength_alone_is_told_where_a_law_is_used():
     law = MohrCoulomb(*ELASTIC, 1.0, 30.0).with_parameters(friction_residual=20.0)
     with pytest.raises(MPMError, match="given: friction_residual"):
         law.initial_state(1, 2)
+
+
+@pytest.mark.parametrize("given", [float, lambda v: np.full(3, v), "Constant"])
+@pytest.mark.parametrize("law", [MohrCoulomb, DruckerPrager])
+def test_angles_in_radians_and_cuts_beyond_the_apex_are_told(law, given):
+    if given == "Constant":
+        mesh = box([0.0, 0.0], [1.0, 1.0], [1, 1], QUADRILATERAL)
+        given = lambda v: fem.Constant(mesh, v)  # noqa: E731
+    with pytest.warns(
+        UserWarning, match=r"0\.52 degrees; if these are radians, give 29\.79"
+    ) as found:
+        law(*ELASTIC, 0.0, given(np.float64(0.52)))
+    assert [warning.filename for warning in found] == [__file__]
+    apex = 10.0 / np.tan(np.radians(30.0))  # 17.32
+    with pytest.warns(UserWarning, match=r"tension_cutoff=18 has no effect, .* of 17\.32 at most"):
+        law(*ELASTIC, given(10.0), given(30.0), tension_cutoff=given(18.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        law(*ELASTIC, given(10.0), given(0.0), tension_cutoff=given(1e6))
+        law(*ELASTIC, given(0.0), given(1.0), tension_cutoff=given(0.0))
+        beside = law(*ELASTIC, given(10.0), given(30.0), given(0.5), given(0.99 * apex))
+        if isinstance(beside.parameters["cohesion"], float):
+            beside.weakened(40.0)
+        law(*ELASTIC, np.array([0.0, 10.0]), np.array([0.1, 30.0]), 0.0, np.array([1.0, 18.0]))
 
 
 @pytest.mark.parametrize("axisymmetric", [False, True])
