@@ -32,9 +32,9 @@ class SectionForces:
 
     In the plane they are per thickness, and shear force and moment are numbers: the moment is
     positive where the side to the right of the axis is in tension (the lower one of a beam drawn
-    from left to right), and the shear force is its derivative along the axis. In space both are
-    vectors: what the part beyond a section does to the part before it. The moment along the axis is
-    the torque.
+    from left to right), and the shear force is its derivative along the axis, but for couples by
+    shear on the faces. In space both are vectors: what the part beyond a section does to the part
+    before it. The moment along the axis is the torque.
 
     Attributes:
         position: Centroids of the sections now, shape ``(m, gdim)``.
