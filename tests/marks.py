@@ -10,7 +10,9 @@ import pytest
 EVERY = 11
 #: Whole runs, whose answers one rank has looked at, and how many of them several ranks do again.
 WHOLE_RUNS = re.compile(
-    r"tests/(contact|plot|solvers|stepping)/|/test_(averaging|mixed|porous|stages|supports)\.py"
+    r"tests/(contact|gradients|plot|solvers|stepping|structures)/|"
+    r"/test_(averaging|damage|error|fills|mixed|porous|rates|sections|stages|strength|supports|"
+    r"undrained)\.py"
 )
 SOME = 4
 #: What ranks do together in them: tests that say so stay.
