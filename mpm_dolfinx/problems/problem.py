@@ -433,7 +433,8 @@ class Problem(Hooked, OwnNames):
 
         Loads count times the load factor, which is that of the last step unless
         ``particles.load`` is set, and so do displacements of supports before the first path;
-        Dirichlet values, and supports after a path, are taken as they are.
+        Dirichlet values, and supports after a path, are taken as they are. A first step at the load
+        factor 0 that moves nothing warns.
 
         Returns:
             The converged step.

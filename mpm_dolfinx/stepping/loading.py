@@ -381,6 +381,15 @@ class Stepper:
                 owner.history.failed_iterations += trial.newton.iterations
                 raise told from error.__cause__
             self._end_step(None)
+            first = load == 0.0 and len(owner.history.steps) == 1
+            moved = any(np.any(body.displacement.x.array) for body in owner.bodies)
+            if first and not over_ranks(comm, moved, MPI.LOR):
+                warn(
+                    comm,
+                    "The step has moved nothing: the load factor is 0, by which loads and "
+                    "displacements of supports are multiplied; set particles.load.value before, or "
+                    "apply them by solve().",
+                )
             if interrupted(comm):
                 self._leave()
         if hold.left:

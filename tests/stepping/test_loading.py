@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Load steps: totals, cutback, roll-back, paths, and what a failed run leaves."""
 
+import warnings
+
 import numpy as np
 import pytest
 import scenes
@@ -501,3 +503,46 @@ def test_run_in_whose_loop_something_else_is_begun(begun, mpi_tmp_path):
     if begun not in ("solve", "restore"):
         problem.solve(2)
         assert problem.history.load[-1] == 1.0
+
+
+def stretched(load=None, lid=0.0, way=0.0):
+    """Return a unit block with a body force, and a top that a condition or a support moves."""
+    V = scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 1.5], [4, 4], QUADRILATERAL))
+    particles = mpm.Particles(scenes.unit(4, QUADRILATERAL), V)
+    tags = mpm.facet_tags(particles.mesh, {1: mpm.region(y=1.0)})
+    top = [mpm.boundary.fixed(particles, tags, 1, value=(0.0, lid))] if lid else []
+    return mpm.QuasiStaticProblem(
+        mpm.Body(particles, LinearElastic(1e4, 0.3), body_force=load),
+        bcs=[mpm.held(V, y=0.0), *([mpm.held(V, 1, y=1.0, value=way)] if way else [])],
+        supports=top,
+    )
+
+
+@pytest.mark.parametrize("given", [{"load": (0.0, -1.0)}, {"lid": 0.1}], ids=str)
+def test_a_first_step_without_a_load_factor_says_that_nothing_has_moved(given):
+    problem = stretched(**given)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        problem.step()
+    mine = [w for w in found if "the load factor is 0" in str(w.message)]
+    assert [w.filename for w in mine] == ([__file__] if WORLD.rank == 0 else [])
+    assert not problem.particles.displacement.x.array.any()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        problem.step()  # told once
+        problem.particles.load.value = 1.0
+        problem.step()
+        moved = stretched(**given)
+        moved.particles.load.value = 0.5
+        moved.step()
+        moved.particles.load.value = 0.0
+        moved.step()
+    assert scenes.largest(problem.particles.displacement.x.array) > 1e-5
+
+
+def test_a_first_step_moves_conditions_as_they_are():
+    problem = stretched(way=0.1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        problem.step()
+        scenes.block().solve(steps=1)
