@@ -34,7 +34,9 @@ def column(n, offset=0.37, settlement=1e-3, comm=WORLD):
     p = mpm.ParticleField(
         particles, fem.functionspace(background, ("Lagrange", 1)), at="nodes", name="pressure"
     )
-    oedometric, poisson = 1.0 / settlement, 0.25
+    # (constants, so that forms of all columns are compiled once)
+    permeability, size = fem.Constant(shape, settlement), fem.Constant(shape, h)
+    oedometric, poisson = 1.0 / permeability, 0.25
     shear = oedometric * (1.0 - 2.0 * poisson) / 2.0 / (1.0 - poisson)
     lame = oedometric - 2.0 * shear
     d, v, q = particles.displacement, ufl.TestFunction(particles.W), ufl.TestFunction(p.W)
@@ -46,11 +48,11 @@ def column(n, offset=0.37, settlement=1e-3, comm=WORLD):
     strain = ufl.sym(ufl.grad(d))
     stress = 2.0 * shear * strain + (lame * ufl.tr(strain) - p) * ufl.Identity(2)
     R_u = ufl.inner(stress, ufl.grad(v)) * particles.dx + v[1] * ds(1)
-    R_u += 1e4 * oedometric / h * d[1] * v[1] * ds(2)
-    flow = -settlement * dt  # permeability times the step: c_v is 1 then
+    R_u += 1e4 * oedometric / size * d[1] * v[1] * ds(2)
+    flow = -permeability * dt  # c_v is 1 then
     R_p = -q * ufl.div(d - before) * particles.dx
     R_p += flow * ufl.dot(ufl.grad(p), ufl.grad(q)) * particles.dx
-    R_p += flow * (10.0 / h * p * q) * ds(1)
+    R_p += flow * (10.0 / size * p * q) * ds(1)
     R_p -= flow * (ufl.dot(ufl.grad(p), normal) * q + ufl.dot(ufl.grad(q), normal) * p) * ds(1)
     bcs = [scenes.fix(V, scenes.at(0, place), component=0) for place in (0.0, 2 * h)]
     problem = mpm.ParticleProblem([R_u, R_p], particles, bcs=bcs, fields=[p], symmetric=True)
