@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, override
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -30,6 +31,7 @@ from ..stepping.automatic import local_error
 from ..system.inertia import Inertia
 from ..system.schemes import order_of
 from ..system.term import Term
+from ..tolerances import NEGLIGIBLE
 from .arguments import as_bodies
 from .through_time import TimeProblem
 
@@ -42,7 +44,7 @@ __all__ = [
 ]
 
 #: Error of the time steps, over the motion, from which on a run that ends says so.
-UNCERTAIN = 0.05
+UNCERTAIN = 0.1
 
 
 class MovingProblem(TimeProblem):
@@ -201,6 +203,10 @@ class MovingProblem(TimeProblem):
         """Say so, once, where steps are too long for the motion."""
         error = self.history.time_error
         if self._told_of_steps or error is None or error <= UNCERTAIN:
+            return
+        moved = max(step.motion or 0.0 for step in self.history.steps)
+        reach = max(float(np.abs(one.node_positions).max(initial=0.0)) for one in self.bodies)
+        if moved <= NEGLIGIBLE * self._comm.allreduce(reach, MPI.MAX):  # round-off of what rests
             return
         self._told_of_steps = True
         times = [energy.time for energy in self._energies]

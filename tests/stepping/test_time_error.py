@@ -62,6 +62,9 @@ def background(comm=WORLD):
     return vectors(box([0.0, 0.0], [2.0, 2.0], [8, 8], QUADRILATERAL, comm))
 
 
+TIGHT = mpm.Solver(petsc_options={"snes_rtol": 1e-12})
+
+
 def block(low, V, comm=WORLD):
     """Return a square of the side 0.5."""
     return mpm.Particles(box(list(low), [x + 0.5 for x in low], [4, 4], QUADRILATERAL, comm), V)
@@ -107,7 +110,7 @@ def bar(scheme):
     return mpm.DynamicProblem(
         mpm.Body(body, LinearElastic(1.0, 0.0), density=1.0, velocity=velocity),
         scheme=scheme,
-        solver=mpm.Solver(petsc_options={"snes_rtol": 1e-11}),
+        solver=TIGHT,
     )
 
 
