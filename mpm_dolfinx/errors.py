@@ -39,6 +39,7 @@ __all__ = [
     "gravest",
     "met",
     "name_particles",
+    "not_with",
     "warn",
     "warn_alone",
 ]
@@ -112,6 +113,17 @@ class ConvergenceError(MPMError):
 #: What says of a trial only that it has gone too far, so that a shorter one may do. All else, such
 #: as what a user's code raises, ends the step.
 TRIAL_ERRORS = (ConvergenceError, DomainDistortionError)
+
+
+def not_with(one: str, other: str, instead: str) -> MPMError:
+    """Return the error that two features cannot be combined.
+
+    Args:
+        one: A feature.
+        other: What it does not go with.
+        instead: What to do.
+    """
+    return MPMError(f"{one} does not go with {other}; {instead}.")
 
 
 def name_particles(particles: Sequence[int], most: int = 8) -> str:

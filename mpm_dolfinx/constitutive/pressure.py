@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._core import loops
-from ..errors import MPMError
+from ..errors import MPMError, not_with
 from ..materials.base import Material, StrainMaterial, Update
 from ..particles.field import ParticleField
 
@@ -65,9 +65,10 @@ def is_split(material: Material) -> bool:
             f"{type(material).__name__}; use f_bar='patch' for others."
         )
     if not material.rises_with_volume:
-        raise MPMError(
-            f"mixed='pressure' needs a law whose mean stress rises with the volume: a "
-            f"{type(material).__name__} may soften under a given shape; use f_bar='patch'."
+        raise not_with(
+            "mixed='pressure'",
+            f"a {type(material).__name__}, which may soften under a given shape",
+            "use f_bar='patch'",
         )
     return is_linear_in_volume(material)
 

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MPMError
+from ..errors import MPMError, not_with
 from ..io.identity import same
 from ..io.snapshot import Kept, Taken
 from ..meshes.remesh import Column
@@ -194,9 +194,10 @@ class Contact(Results):
                 stress are.
         """
         if self._nitsche and share < 1.0:
-            raise MPMError(
-                f"law='nitsche' of a {type(self).__name__} has forces of a step's end, and would "
-                "add energy with each impact in this scheme; use scheme='euler', or law='penalty'."
+            raise not_with(
+                f"law='nitsche' of a {type(self).__name__}",
+                "this scheme, to which forces of a step's end would add energy with each impact",
+                "use scheme='euler', or law='penalty'",
             )
         self._share = share
         self._passes.of_step(self._of_step)

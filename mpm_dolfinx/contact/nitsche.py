@@ -22,7 +22,7 @@ from dolfinx import fem
 
 from ..assembly.petsc import MatrixSum
 from ..constitutive.averaging import VolumeAveraging
-from ..errors import MPMError
+from ..errors import MPMError, not_with
 from ..system.term import PointMaterial
 from .behind import At, Behind
 from .surface import Blocks, PointMatrix, Surface, global_dofs
@@ -49,9 +49,10 @@ def require_stress(material: PointMaterial | None, what: str) -> None:
             f"forms of this problem alone; use a QuasiStaticProblem, or {instead}."
         )
     if material.mean_stress is not None:
-        raise MPMError(
-            f"law='nitsche' of a {what} does not go with mixed='pressure', whose stress depends "
-            f"on another field; {instead}, or f_bar='patch'."
+        raise not_with(
+            f"law='nitsche' of a {what}",
+            "mixed='pressure', whose stress depends on another field",
+            f"{instead}, or f_bar='patch'",
         )
 
 

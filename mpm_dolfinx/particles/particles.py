@@ -533,8 +533,8 @@ def require_shared_nodes(what: str, body: Any) -> None:
     """
     if not isinstance(body, Particles) or not body.shares_nodes:
         raise MPMError(
-            f"{what} needs mpm.Particles whose domains share their nodes: of method='cpdi2', made "
-            "of one mesh, or finite elements."
+            f"{what} needs method='cpdi2' of mpm.Particles, whose domains share their nodes, or "
+            "finite elements."
         )
 
 

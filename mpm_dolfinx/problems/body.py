@@ -24,10 +24,15 @@ from ..reals import is_one_of
 from .arguments import as_pairs, carried, holds
 from .summary import counted
 
-__all__ = ["Body", "PoreFluid", "as_given"]
+__all__ = ["Body", "PoreFluid", "as_given", "stays"]
 
 #: What a body begins with, which a stage cannot change.
 INITIAL = ("initial_stress", "velocity")
+
+
+def stays(what: str, consequence: str) -> MPMError:
+    """Return the error that something does not follow a body to another mesh."""
+    return MPMError(f"{what} lives on the present body mesh, so {consequence}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +266,7 @@ class Body:
         """Raise an error unless the nodes of the body's mesh can be moved; see above."""
         self.require_movable(consequence)
         if self.length is not None:
-            raise MPMError(f"length= averages over the undeformed body, so {consequence}.")
+            raise stays("length=", consequence)
         for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
             if holds(getattr(self, name), Callable):
                 raise MPMError(

@@ -18,7 +18,7 @@ from ..boundary.supports import Support
 from ..constitutive.beginning import take_over
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
-from ..errors import MPMError, warn
+from ..errors import MPMError, not_with, warn
 from ..parallel.boundary import collective
 from ..parallel.given import is_number, require_same
 from ..particles.particles import Particles
@@ -389,7 +389,7 @@ def _static_among(
     ):
         raise MPMError("quasi_static= needs a list of some of the problem's own particles.")
     if given and options.get("mixed") is not None:
-        raise MPMError("quasi_static= does not go with mixed='pressure'; use f_bar= there.")
+        raise not_with(f"mixed={options['mixed']!r}", "quasi_static=", "use f_bar=")
     static = [any(body.particles is one for one in given) for body in bodies]
     if all(static):
         raise MPMError(

@@ -16,7 +16,7 @@ from ..boundary.supports import Support
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..constitutive.strain import Strain, strain_of
-from ..errors import MPMError
+from ..errors import MPMError, not_with
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import Particles
 from ..system.body import StepForce
@@ -124,7 +124,7 @@ def damages(setup: Setup, physics: Physics) -> list[Damage]:
         }
         for what, given in refused.items():
             if given:
-                raise MPMError(f"Fracture does not go with {what}.")
+                raise not_with("Fracture", what, "omit it")
         found.append(Damage(body.particles, body.material, body.cell_tags))
     return found
 

@@ -30,7 +30,7 @@ from ufl.core.expr import Expr
 
 from ..assembly.inputs import NotNegative, as_expression, facet_measure
 from ..constitutive.strain import Strain
-from ..errors import MPMError, agree, as_ours
+from ..errors import MPMError, agree, as_ours, not_with
 from ..materials.base import Material
 from ..parallel.boundary import collective
 from ..parallel.given import is_number, require_same
@@ -288,9 +288,10 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         wet = [one.particles for one in filled]
         for term in self.terms:
             if term.takes_stress and any(body is its for body in wet for its in term.bodies):
-                raise MPMError(
-                    "law='nitsche' takes the stress of the material, which does not know the pore "
-                    "pressure of a body with water; use law='penalty'."
+                raise not_with(
+                    f"law='nitsche' of a {type(term).__name__}",
+                    "water, whose pressure the stress of the material does not know",
+                    "use law='penalty'",
                 )
         self.fields = self.pore_pressure
         self._of_fields = [one.residual for one in filled if one.residual is not None]

@@ -20,7 +20,7 @@ from ..constitutive.assignment import equal_laws
 from ..constitutive.beginning import begin_unstrained, begin_with_stress
 from ..constitutive.groups import background_cells
 from ..constitutive.identity import identity
-from ..errors import MPMError, agree, warn
+from ..errors import MPMError, agree, not_with, warn
 from ..meshes.redistribution import Redistribution
 from ..parallel.boundary import collective
 from ..parallel.given import is_number
@@ -307,7 +307,7 @@ class QuasiStaticProblem(Problem):
         if not isinstance(body, int | np.integer) or body not in range(len(self.bodies)):
             raise MPMError(f"There is no body {body!r}; there are {len(self.bodies)}.")
         if self.setup.bodies[body].may_crack:
-            raise MPMError("Cells cannot be removed from a body with a law of fracture.")
+            raise not_with("Fracture", "remove()", "choose cells of another body")
         own = self.setup.bodies[body]
         cells = chosen_cells(self.bodies[body], particles, tags, own.cell_tags)
         self._go_on(name, Removal(self, body, cells), sudden)

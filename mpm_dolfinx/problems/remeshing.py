@@ -256,8 +256,8 @@ class Remeshing:
             degree, cells = body.W.ufl_element().degree, _compat.geometry_degree(body.mesh)
             if body.is_free or not body.shares_nodes or cells not in (1, degree):
                 raise MPMError(
-                    "Only a body that moves by 'cpdi2', with straight cells or such of its own "
-                    "degree, can be rebased."
+                    "rebase() needs method='cpdi2' without free nodes, and cells that are straight "
+                    "or of the body's own degree."
                 )
             with agree(body.mesh.comm):
                 bad = np.union1d(body.folded(), body.global_index[body.deleted])

@@ -12,13 +12,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from ..boundary.supports import Support
-from ..errors import MPMError
+from ..errors import MPMError, not_with
 from ..parallel.given import require_truth
 from ..particles.options import not_divisible
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from ..system.term import Term
-from .body import Body
+from .body import Body, stays
 
 __all__ = ["MIXED", "Setup"]
 
@@ -70,14 +70,17 @@ class Setup:
             raise MPMError(f"Unknown mixed={self.mixed!r}; choose {known} or None.")
         for given in self.bodies:
             if given.f_bar != "none":
-                raise MPMError(f"mixed={self.mixed!r} takes the place of f_bar; omit f_bar.")
+                raise not_with(
+                    f"mixed={self.mixed!r}", "f_bar=", "it takes the place of f_bar; omit that"
+                )
             body = given.particles
             degrees = [space.ufl_element().degree for space in (body.V, body.W)]
             if self.mixed == "stabilised pressure":
                 if degrees != [1, 1]:
-                    raise MPMError(
-                        "mixed='stabilised pressure' is for a background and particles of degree "
-                        f"1, not {degrees[0]} and {degrees[1]}; use mixed='pressure' there."
+                    raise not_with(
+                        "mixed='stabilised pressure'",
+                        f"a background of degree {degrees[0]} and particles of degree {degrees[1]}",
+                        "it is for degree 1; use mixed='pressure'",
                     )
                 if body.V.mesh.topology.cell_name() not in ("quadrilateral", "hexahedron"):
                     raise MPMError(
@@ -134,9 +137,7 @@ class Setup:
     def require_no(self, staying: Iterable[Support | Term], consequence: str) -> None:
         """Raise an error where there is one that does not follow its body."""
         for one in staying:
-            raise MPMError(
-                f"A {type(one).__name__} lives on the present body mesh, so {consequence}."
-            )
+            raise stays(f"A {type(one).__name__}", consequence)
 
     def require_divisible(self) -> None:
         """Raise an error unless domains may be split.

@@ -61,7 +61,7 @@ FEATURES = {
     "degree 3": {"degree": 3},
     "f_bar domain": {"f_bar": "domain", "quadrature": 2},
     "f_bar patch": {"f_bar": "patch"},
-    "axisymmetric": {"axisymmetric": True},
+    "axisymmetric": {"axisymmetric": True, "dim": 2},
     "3-D": {"dim": 3},
     "bodies on one V": {"bodies": "one V"},
     "bodies on several V": {"bodies": "several V"},
@@ -548,6 +548,11 @@ def test_the_page_has_each_feature_and_no_other():
             assert len(pair & kinds) == 1 and pair - kinds <= {*FEATURES} - {*STILL}
 
 
+def test_a_body_of_revolution_is_in_the_plane():
+    with pytest.raises(mpm.MPMError, match=r"An axisymmetric body is a mesh in the \(r, z\) plane"):
+        Scene({"axisymmetric": True, "dim": 3})
+
+
 def test_nothing_is_refused_that_excludes_itself():
     for one, other in AT_REST:
         assert not excludes(FEATURES[one], FEATURES[other])
@@ -711,7 +716,7 @@ def test_a_feature_with_water(feature, mpi_tmp_path, monkeypatch):
 #: What does not go together with a stage that takes cells away, and why.
 NO_STAGES = {
     "rebase": "are concave or deleted, so the body cannot be rebased",
-    "Fracture": "Cells cannot be removed from a body with a law of fracture",
+    "Fracture": "Fracture does not go with remove()",
 }
 
 

@@ -1265,7 +1265,7 @@ def test_what_a_dashpot_on_a_body_without_inertia_takes_counts_once(scheme):
         ("needs a list of some of the problem's own particles", {"quasi_static": "all"}),
         ("at least one body must move", {"quasi_static": ...}),
         ("has no velocity; omit it", {"velocity": (0.0, 1.0)}),
-        ("does not go with mixed='pressure'", {"mixed": "pressure"}),
+        ("mixed='pressure' does not go with quasi_static=", {"mixed": "pressure"}),
     ],
 )
 def test_what_bodies_without_inertia_do_not_go_with(message, options):
