@@ -65,6 +65,7 @@ class _Faceted(Shape):
         radius: Of edges and corners.
         pivot: The point about which it turns; ``None``: the middle of the box around it.
         what: The surface, in a sentence.
+        mean: Whether it turns about the mean of its points instead.
 
     Attributes:
         points: Corners of the facets, which lie within the surface by the radius.
@@ -84,6 +85,7 @@ class _Faceted(Shape):
         radius: float,
         pivot: Any,
         what: str = "The surface",
+        mean: bool = False,
     ) -> None:
         self._radius = as_radius(radius)
         self._outline, facets = _merged(x, facets)
@@ -92,7 +94,9 @@ class _Faceted(Shape):
         facets = self.facets = oriented(self._outline, facets, outside, what)
         points = self.points = _inner(self._outline, facets, self._radius, what)
         dim = x.shape[1]
-        middle = self.bounds.mean(axis=0) if pivot is None else as_point(pivot, "pivot", dim)
+        middle = (points if mean else self.bounds).mean(axis=0)
+        if pivot is not None:
+            middle = as_point(pivot, "pivot", dim)
         super().__init__(dim, middle)
         self._on = ROUND_OFF * float(np.abs(points).max(initial=0.0))
         corners = points[facets]
@@ -242,9 +246,7 @@ def polygon(corners: Any, radius: float = 0.0) -> Shape:
         raise MPMError(f"A polygon needs three corners (x, y) or more, not {corners!r}.")
     count = np.arange(len(given))
     edges = np.column_stack([count, np.roll(count, -1)])
-    shape = _Faceted(given, edges, None, radius, None, "The polygon")
-    shape.pivot = shape.points.mean(axis=0)
-    return shape
+    return _Faceted(given, edges, None, radius, None, "The polygon", mean=True)
 
 
 def polyline(points: Any, *, outside: Any = None, radius: float = 0.0, pivot: Any = None) -> Shape:

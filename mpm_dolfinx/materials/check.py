@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError
 from ..parallel.given import as_positive, is_number, require_whole
+from ..tolerances import INEXACT
 from .base import Material, State
+from .derivatives import RELATIVE_STEP
 
 __all__ = ["check_tangent"]
 
-STEPS = (1e-3, 1e-4)
-"""Steps of the differences over the size of the increment."""
 STENCIL = np.array([-25.0, 48.0, -36.0, 16.0, -3.0]) / 12.0
 """Weights of a one-sided difference of fourth order."""
 
@@ -95,7 +95,7 @@ def check_tangent(
         # Where yield sets in nearby, one side and the smaller step are still smooth.
         errors = [
             np.abs(A - _differences(material, H, state, signed * size))
-            for h in STEPS
+            for h in (RELATIVE_STEP, INEXACT * RELATIVE_STEP)
             for signed in (h, -h)
         ]
         error = np.min(errors, axis=0).max(axis=(1, 2, 3, 4)) / largest

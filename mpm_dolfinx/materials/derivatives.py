@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .mandel import deviator, norm
 
-__all__ = ["difference_by_stress", "slope_by_plastic_strain", "slope_by_stress"]
+__all__ = ["RELATIVE_STEP", "difference_by_stress", "slope_by_plastic_strain", "slope_by_stress"]
 
 type Function = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 """Function of stress ``(n, m)`` and plastic strain ``(n,)`` with values ``(n, ...)``."""

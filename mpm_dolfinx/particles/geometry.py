@@ -16,6 +16,7 @@ from dolfinx import fem, mesh
 from ..errors import DomainDistortionError, agree
 from ..meshes.cells import equispaced_element, input_cell_index
 from ..meshes.jacobian_bound import JacobianBound
+from ..meshes.order import vtk_cell
 from ..meshes.quadrature import (
     DomainQuadrature,
     default_degree,
@@ -28,7 +29,7 @@ from .options import Coordinates
 __all__ = ["RING", "Geometry"]
 
 #: Corners of a quadrilateral one after the other.
-RING = (0, 1, 3, 2)
+_, RING = vtk_cell(basix.CellType.quadrilateral, 1, 4)
 
 
 class Geometry:
@@ -168,7 +169,7 @@ class Geometry:
         """Whether each domain is a quadrilateral with two corners in one place, shape ``(n,)``."""
         if self.mesh.basix_cell() != basix.CellType.quadrilateral:
             return np.zeros(self.num_local, dtype=bool)
-        ring = self.corners[:, list(RING)]
+        ring = self.corners[:, RING]
         edges = np.linalg.norm(ring - np.roll(ring, 1, axis=1), axis=2)
         return np.asarray(edges.min(axis=1) <= 1e-12 * edges.max(axis=1))
 

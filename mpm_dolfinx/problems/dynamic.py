@@ -29,6 +29,7 @@ from ..system.term import Term
 from .arguments import as_bodies, as_supports, as_terms
 from .body import Body, as_given
 from .motion import (
+    UNCERTAIN,
     MovingProblem,
     initial_velocities,
     initial_velocity,
@@ -43,9 +44,6 @@ from .setup import Setup
 from .stages import join
 
 __all__ = ["DynamicParticleProblem", "DynamicProblem"]
-
-#: Share of the energies of a motion that stress may give it beyond what is stored.
-GAIN = 0.1
 
 
 class _Motion(Physics):
@@ -263,7 +261,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         gain = most - now.dissipated
         if self._told_of_gain or scheme.share == 1.0:
             return
-        if gain > GAIN * (now.kinetic + now.strain + most):
+        if gain > 2.0 * UNCERTAIN * (now.kinetic + now.strain + most):  # (squares of a motion)
             self._told_of_gain = True
             warn(
                 self._comm,

@@ -36,6 +36,7 @@ from .arguments import as_bodies
 from .through_time import TimeProblem
 
 __all__ = [
+    "UNCERTAIN",
     "MovingProblem",
     "initial_velocities",
     "initial_velocity",
