@@ -256,8 +256,7 @@ class Problem(Hooked, OwnNames):
             self.release()
         vars(self).clear()
 
-    def __repr__(self) -> str:
-        return in_one_line(self)
+    __repr__ = in_one_line
 
     @collective()
     def summary(self) -> str:

@@ -275,7 +275,7 @@ def order_of(comm: MPI.Comm, scheme: Scheme) -> tuple[int, float]:
 
 
 def _error_of_oscillation(scheme: Scheme, dt: float, comm: MPI.Comm) -> float:
-    """Return what a step makes wrong of an oscillation of the size and frequency 1."""
+    """Return the error that a step makes of an oscillation of size and frequency 1."""
     rates = rates_of(comm, scheme, dt, dt)
     increment = np.zeros(2 + len(scheme.keeps))  # by displacement, velocity and what is kept
     increment[0], increment[1:] = -1.0, -rates.acceleration[1:]
