@@ -330,13 +330,13 @@ def _not_in(problem: Problem) -> list[str]:
     missing = {
         "a pressure in place of the mean stress (mixed=)": setup and setup.mixed is not None,
         "a law of fracture (materials.Fracture)": setup and any(b.may_crack for b in setup.given),
+        "bodies with a length=": any(points.softening is not None for points in problem.points),
         "fields that are solved in turn with the displacements": problem.reduced.terms.alternates,
         "terms= (contact, ties)": any(term is not own for term in problem.terms),
         "particles of other methods than 'cpdi2'": any(
             not (b.method == "cpdi2" or b.is_free) for b in bodies
         ),
         "bodies with free nodes (free=)": any(b.free_nodes is not None for b in bodies),
-        "bodies with a length=": any(points.softening is not None for points in problem.points),
         "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),
         "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),
         "rebased bodies": any(b.undeformed.differs for b in bodies),
