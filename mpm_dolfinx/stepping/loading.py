@@ -386,9 +386,9 @@ class Stepper:
             if first and not over_ranks(comm, moved, MPI.LOR):
                 warn(
                     comm,
-                    "The step has moved nothing: the load factor is 0, by which loads and "
-                    "displacements of supports are multiplied; set particles.load.value before, or "
-                    "apply them by solve().",
+                    "The step has moved nothing, at a load factor of 0, by which loads and "
+                    "displacements of supports are multiplied; if these were to act, set "
+                    "particles.load.value before, or apply them by solve().",
                 )
             if interrupted(comm):
                 self._leave()

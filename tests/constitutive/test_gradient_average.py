@@ -77,7 +77,7 @@ def test_domains_without_common_nodes_are_refused():
     body = mesh.create_rectangle(comm, [[1, 1], [2, 2]], [2, 2], mesh.CellType.quadrilateral)
     particles = mpm.Particles(body, V, method="mpm")
     law = mpm.materials.Tresca(1e3, 0.3, 1.0).with_softening(10.0, cohesion=0.5)
-    with pytest.raises(mpm.MPMError, match="length= needs method='cpdi2' of mpm.Particles"):
+    with pytest.raises(mpm.MPMError, match=r"length= needs method='cpdi2' of mpm\.Particles"):
         mpm.QuasiStaticProblem(mpm.Body(particles, law, length=0.1))
 
 

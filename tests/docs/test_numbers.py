@@ -74,7 +74,7 @@ for table in validation.tables().values():
 """
 
     def hashes():
-        # (bytecode of a file that is edited within a second, and keeps its size, looks up to date)
+        # (bytecode of a file that is edited within a second at the same size looks up to date)
         studies = tmp_path / "docs" / "studies"
         done = programs.run("-c", program, cwd=studies, PYTHONDONTWRITEBYTECODE="1")
         assert done.returncode == 0, done.stderr
