@@ -524,7 +524,7 @@ def test_a_first_step_without_a_load_factor_says_that_nothing_has_moved(given):
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         problem.step()
-    mine = [w for w in found if "the load factor is 0" in str(w.message)]
+    mine = [w for w in found if "at a load factor of 0" in str(w.message)]
     assert [w.filename for w in mine] == ([__file__] if WORLD.rank == 0 else [])
     assert not problem.particles.displacement.x.array.any()
     with warnings.catch_warnings():
