@@ -261,7 +261,7 @@ class DynamicProblem(MovingProblem, QuasiStaticProblem):
         gain = most - now.dissipated
         if self._told_of_gain or scheme.share == 1.0:
             return
-        if gain > 2.0 * UNCERTAIN * (now.kinetic + now.strain + most):  # (squares of a motion)
+        if gain > UNCERTAIN * (now.kinetic + now.strain + most):
             self._told_of_gain = True
             warn(
                 self._comm,
