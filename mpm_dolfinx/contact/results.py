@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..meshes.quadrature import vector_product
 from ..reals import as_finite
 from ..system.term import Term
 from .one_pass import Pass
@@ -107,13 +108,6 @@ class Results(Term):
         centre = as_finite(about, gdim)
         if centre is None:
             raise MPMError(f"A moment is about {gdim} coordinates, not {about!r}.")
-        parts = [crossed(x - centre, force).sum(axis=0) for x, force in self._forces()]
+        parts = [vector_product(x - centre, force).sum(axis=0) for x, force in self._forces()]
         whole = np.atleast_1d(np.sum(parts, axis=0))
         return np.asarray(self.bodies[0].mesh.comm.allreduce(whole))
-
-
-def crossed(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """Return the vector product of rows; in the plane its one component."""
-    if a.shape[-1] == 3:
-        return np.cross(a, b)
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -24,6 +24,7 @@ __all__ = [
     "nodal_forces",
     "quadrature_element",
     "quadrature_rule",
+    "vector_product",
     "volume_ratio",
     "volumes_and_averages",
     "with_hoop",
@@ -251,3 +252,10 @@ def volume_ratio(gradient: NDArray[np.float64]) -> NDArray[np.float64]:
             - H[..., 0, 1] * (H[..., 1, 0] * z - H[..., 1, 2] * H[..., 2, 0])
             + H[..., 0, 2] * (H[..., 1, 0] * H[..., 2, 1] - y * H[..., 2, 0])
         )
+
+
+def vector_product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the vector product of rows; in the plane its one component."""
+    if a.shape[-1] == 3:
+        return np.cross(a, b)
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

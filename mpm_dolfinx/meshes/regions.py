@@ -20,7 +20,7 @@ from ..parallel.boundary import collective
 from ..reals import as_reals
 from ..tolerances import NEGLIGIBLE
 
-__all__ = ["cell_tags", "facet_tags", "held", "marked", "region"]
+__all__ = ["cell_tags", "facet_tags", "held", "in_space", "marked", "region"]
 
 type Where = Callable[[NDArray[np.float64]], Any]
 
@@ -75,6 +75,13 @@ def region(
         return found if corners is None else found & _in_polygon(places, corners, near)
 
     return inside
+
+
+def in_space(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return points ``(n, gdim)`` as functions of coordinates are given them, shape ``(3, n)``."""
+    x = np.zeros((3, len(points)))
+    x[: points.shape[1]] = points.T
+    return x
 
 
 def marked(where: Where, points: NDArray[np.float64], what: str) -> NDArray[np.bool_]:

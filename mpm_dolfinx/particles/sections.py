@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from dolfinx import mesh
 
 from ..errors import MPMError, agree
-from ..meshes.regions import marked
+from ..meshes.quadrature import nodal_forces, vector_product
+from ..meshes.regions import in_space, marked
 from ..parallel.boundary import collective
 from ..parallel.totals import over_ranks
 from ..reals import as_reals, as_wholes
@@ -129,16 +130,18 @@ class _Sections:
         cauchy = particles.point_total_stress[cells, :, :gdim, :gdim]
         ratio = np.linalg.det(particles.point_deformation_gradient[cells])
         piola = ratio[..., None, None] * np.linalg.solve(self._F, cauchy).swapaxes(2, 3)
-        self._forces = np.einsum("nq,nqij,nqkj->nki", self._weights, piola, self._gradients)
+        self._forces = nodal_forces(piola, self._weights, self._gradients, None)
         self._along = np.diff(points, axis=0) / _lengths(points)[:, None]
-        self._steps = list(_steps(points, particles.initial_domains[cells]))
+        self._cuts = []
+        for step in _steps(points, particles.initial_domains[cells]):
+            cut = np.flatnonzero(np.ptp(step, axis=1) > 0.0)
+            self._cuts.append((cut, step[cut]))
 
     def measures(self) -> tuple[Array, Array, Array]:
         """Return areas, and their integrals of position and of the direction along the axis."""
         area, position, direction = [], [], []
-        for step, along in zip(self._steps, self._along, strict=True):
-            cut = np.ptp(step, axis=1) > 0.0
-            slope = np.einsum("nk,nqki->nqi", step[cut], self._gradients[cut]) @ along
+        for (cut, step), along in zip(self._cuts, self._along, strict=True):
+            slope = np.einsum("nk,nqki->nqi", step, self._gradients[cut]) @ along
             parts = self._weights[cut] * slope
             area.append(parts.sum())
             position.append(np.einsum("nq,nqi->i", parts, self._points[cut]))
@@ -148,20 +151,12 @@ class _Sections:
     def forces(self, centres: Array) -> tuple[Array, Array]:
         """Return forces, and moments about the centres of the sections."""
         force, moment = [], []
-        for step, centre in zip(self._steps, centres, strict=True):
-            cut = np.ptp(step, axis=1) > 0.0
-            shares = step[cut, :, None] * self._forces[cut]
+        for (cut, step), centre in zip(self._cuts, centres, strict=True):
+            shares = step[:, :, None] * self._forces[cut]
             arms = self._nodes[cut] - centre
             force.append(shares.sum(axis=(0, 1)))
-            moment.append(_cross(arms, shares).sum(axis=(0, 1)))
+            moment.append(vector_product(arms, shares).sum(axis=(0, 1)))
         return np.array(force), np.array(moment)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Return the cross product of vectors, in the plane its only component."""
-    if a.shape[-1] == 2:
-        return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
-    return np.cross(a, b)
 
 
 def _points(axis: Any, gdim: int) -> Array:
@@ -184,18 +179,20 @@ def _chosen(particles: Particles, where: Any) -> NDArray[np.bool_]:
     if where is None:
         return np.ones(particles.num_local, dtype=bool)
     if callable(where):
-        x = np.zeros((3, particles.num_local))
-        x[: particles.geometry.gdim] = particles.initial_centroid.T
-        return marked(where, x, "The function where=")
+        return marked(where, in_space(particles.initial_centroid), "The function where=")
     if not (isinstance(where, tuple) and len(where) == 2 and isinstance(where[0], mesh.MeshTags)):
         raise MPMError(
             "where= is a function of coordinates such as mpm.region(...), or (cell tags, tag), not "
             f"{where!r}."
         )
     tags, wanted = where
+    try:
+        wanted = as_wholes(wanted)
+    except (TypeError, ValueError):
+        raise MPMError(f"The tags of where= are whole numbers, not {wanted!r}.") from None
     mine = tags.indices < particles.num_local
     chosen = np.zeros(particles.num_local, dtype=bool)
-    chosen[tags.indices[mine]] = np.isin(tags.values[mine], as_wholes(wanted))
+    chosen[tags.indices[mine]] = np.isin(tags.values[mine], wanted)
     return chosen
 
 

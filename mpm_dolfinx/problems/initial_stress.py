@@ -19,6 +19,7 @@ from dolfinx import fem
 from ..assembly.inputs import as_expression
 from ..errors import MPMError, agree, as_ours, warn
 from ..meshes.quadrature import quadrature_rule
+from ..meshes.regions import in_space
 from ..parallel.compilation import compiled_expression
 from ..particles.particles import Particles
 from ..reals import as_reals
@@ -269,10 +270,8 @@ def _in_words(values: Sequence[float]) -> str:
 
 def _coordinates(particles: Particles) -> Array:
     """Return where the history's points were at first, shape ``(3, n nq)``."""
-    points = particles.initial_points.reshape(-1, particles.initial_points.shape[-1])
-    x = np.zeros((3, len(points)))
-    x[: points.shape[1]] = points.T
-    return x
+    points = particles.initial_points
+    return in_space(points.reshape(-1, points.shape[-1]))
 
 
 def _evaluated(value: Any, particles: Particles) -> Array:

@@ -44,7 +44,7 @@ __all__ = [
     "require_motion",
 ]
 
-#: Error of the time steps, over the motion, from which on a run that ends says so.
+#: Share from which on a motion says so: error of the time steps over it, gain over its energies.
 UNCERTAIN = 0.1
 
 

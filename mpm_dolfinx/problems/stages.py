@@ -7,7 +7,7 @@ Each is a :class:`~mpm_dolfinx.problems.staging.Change`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol, override
 
@@ -19,7 +19,7 @@ from ..constitutive.moduli import mean_shear_modulus
 from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..io.snapshot import spaces_of
-from ..meshes.regions import marked
+from ..meshes.regions import in_space, marked
 from ..particles.particles import Particles
 from ..reals import as_wholes
 from ..system.term import Term
@@ -223,7 +223,8 @@ def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) ->
         if tags is not None:
             chosen, unknown = _tagged(particles, tags, cell_tags)
         elif callable(which):
-            chosen, unknown = _where(particles, which), []
+            x = in_space(particles.initial_centroid)
+            chosen, unknown = marked(which, x, "The function that chooses particles"), []
         else:
             try:
                 indices = as_wholes(which).ravel()
@@ -264,11 +265,3 @@ def _tagged(particles: Particles, tags: Any, cell_tags: Any) -> tuple[NDArray[np
     chosen = np.zeros(particles.num_local, dtype=bool)
     chosen[cell_tags.indices[own & np.isin(cell_tags.values, wanted)]] = True
     return chosen, np.setdiff1d(wanted, cell_tags.values).tolist()
-
-
-def _where(particles: Particles, which: Callable[[NDArray[np.float64]], Any]) -> NDArray[np.bool_]:
-    """Return in which domains a function of coordinates holds."""
-    x = np.zeros((3, particles.num_local))
-    centroid = particles.initial_centroid
-    x[: centroid.shape[1]] = centroid.T
-    return marked(which, x, "The function that chooses particles")

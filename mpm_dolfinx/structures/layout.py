@@ -16,7 +16,7 @@ from dolfinx import mesh
 
 from .. import _compat
 from ..errors import MPMError, agree
-from ..meshes.regions import marked
+from ..meshes.regions import in_space, marked
 from ..reals import as_reals
 
 __all__ = ["Layout", "chosen", "layout_of"]
@@ -86,9 +86,7 @@ def chosen(where: Any, layout: Layout, what: str) -> NDArray[np.bool_]:
     """
     if not callable(where):
         raise MPMError(f"{what} is a function of coordinates such as mpm.region(...).")
-    x = np.zeros((3, len(layout.nodes)))
-    x[: layout.nodes.shape[1]] = layout.nodes.T
-    return marked(where, x, f"The function {what}")
+    return marked(where, in_space(layout.nodes), f"The function {what}")
 
 
 def layout_of(given: Any, comm: MPI.Comm, gdim: int, what: str, surfaces: bool) -> Layout:

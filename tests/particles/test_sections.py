@@ -251,6 +251,8 @@ def test_what_makes_no_sense_is_refused():
     for axis in ([(0.5, 0.0)], [0.5, 1.0], "middle", [(0.5, np.nan), (0.5, 1.0)], [(0, 0)] * 2):
         fails(lambda axis=axis: mpm.section_forces(particles, axis), "axis= must be two points")
     fails(lambda: mpm.section_forces(particles, line, 3), "where= is a function")
+    tags = mpm.cell_tags(body, {1: mpm.region(x=(0.0, 0.5))})
+    fails(lambda: mpm.section_forces(particles, line, (tags, "wall")), "are whole numbers")
     fails(lambda: mpm.section_forces(particles, line, lambda x: x[0]), "one bool for each")
     nowhere = mpm.region(x=(3.0, 4.0))
     fails(lambda: mpm.section_forces(particles, line, nowhere), "is not between points 0 and 1")

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from obstacles import wall
+from own_schemes import BDF2, Theta
 from scenes import QUADRILATERAL, WORLD, anywhere, box, gather, vectors
 
 import mpm_dolfinx as mpm
@@ -14,33 +15,6 @@ from mpm_dolfinx.meshes.redistribution import Redistribution
 from mpm_dolfinx.system.schemes import Conserving, Euler, Midpoint, order_of
 
 
-class BDF2(mpm.Scheme):
-    """Backward differences of second order."""
-
-    name = "bdf2"
-    keeps = ("increment", "change of velocity")
-
-    def rates(self, dt, last):
-        ratio = dt / last if last > 0.0 else 0.0
-        now, before = (1 + 2 * ratio) / (1 + ratio) / dt, ratio**2 / (1 + ratio) / dt
-        increment, begin, last_increment, last_change = np.eye(4)
-        velocity = now * increment - before * last_increment
-        change = velocity - begin
-        acceleration = now * change - before * last_change
-        return mpm.Rates(acceleration, velocity, velocity, (increment, change))
-
-
-class Theta(mpm.Scheme):
-    """Between the midpoint rule (0.5) and backward Euler (1)."""
-
-    name, share = "theta", 0.7
-
-    def rates(self, dt, last):
-        mean, begin = np.array([1.0 / dt, 0.0]), np.array([0.0, 1.0])
-        velocity = (mean - (1.0 - self.share) * begin) / self.share
-        return mpm.Rates((velocity - begin) / dt, mean, velocity)
-
-
 @pytest.mark.parametrize(
     ("scheme", "order", "constant"),
     [
@@ -48,7 +22,7 @@ class Theta(mpm.Scheme):
         (Midpoint(reflects=True), 2, 1 / 12),
         (Conserving(), 2, 1 / 12),
         (Euler(), 1, 1 / 2),
-        (Theta(), 1, 0.7 - 0.5),
+        (Theta(0.7), 1, 0.7 - 0.5),
         (BDF2(), 2, 1 / 3),
     ],
 )
