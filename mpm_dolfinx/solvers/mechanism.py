@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import ConvergenceError, MPMError
 from ..parallel.magnitudes import norm
-from ..tolerances import LOCAL_ITERATIONS, SMALL
+from ..tolerances import LAST_PLACES, LOCAL_ITERATIONS, SMALL
 from .linear import ShiftedFactor
 from .problem import Levels, Resisting
 
@@ -22,7 +22,8 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
 
     Solving for the forces of that term, again and again, leaves what gives way to them most;
     the stiffness along it tells a soft body, or a stiff one on a soft one, from a motion
-    without any.
+    without any. That of values that are no displacements is the sum of terms that cancel, and
+    known to the last places of the tangent only.
 
     Args:
         system: What resists.
@@ -31,7 +32,7 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
     """
     assert factor.D is not None
     mode, force = y.copy(), y.duplicate()
-    before = np.inf
+    before, last_places = np.inf, LAST_PLACES / factor.shift
     for _ in range(LOCAL_ITERATIONS):
         force.pointwiseMult(mode, factor.D)
         force.scale(1.0 / norm(force))
@@ -43,7 +44,7 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
             ratio = abs(system.stiffness(mode)) / mode.dot(force)
         else:
             ratio = system.stiffness(mode) / mode.dot(force)
-        if ratio <= SMALL:
+        if ratio <= SMALL or (ratio <= last_places and system.field_of(mode) is not None):
             return mode
         if ratio > 0.95 * before:
             return None
