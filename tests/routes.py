@@ -19,6 +19,7 @@ from mpm_dolfinx.materials.base import StrainMaterial
 from mpm_dolfinx.materials.compiled import CompiledMaterial
 from mpm_dolfinx.problems import parts, physics
 from mpm_dolfinx.system.pressure import PressureTerm
+from mpm_dolfinx.system.term import Term
 
 #: Where tangents come from: compiled loops, domain by domain, or the reference.
 ROUTES = ["loops", "reference"]
@@ -159,13 +160,7 @@ class ReferencePressure(PressureTerm):
         return {(0, 1): by_points, (1, 0): of_strain, (1, 1): alone}
 
     def stiffness_force(self, motions):
-        found = self.tangents()
-        forces = [motion.duplicate() for motion in motions]
-        for force in forces:
-            force.set(0.0)
-        for (a, b), K in found.items():
-            K.multAdd(motions[b], forces[a], forces[a])
-        return forces
+        return Term.stiffness_force(self, motions)
 
     def _matrices(self):
         """Return matrices of strain and of stress, points by nodes, and the other two blocks."""

@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 
-class Kept(Hooked):
+class Kept(Hooked, hooks=True):
     """Something that goes with a problem: split, moved to other ranks, saved and restored.
 
     A heir says what it is and where it lives, and takes it again; give it to

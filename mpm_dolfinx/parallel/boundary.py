@@ -18,15 +18,25 @@ from typing import Any, cast
 
 from mpi4py import MPI
 
-from ..errors import agree, called_last, forget
+from ..errors import MPMError, agree, called_last, forget
 from .given import is_ours, require_same
 from .kinds import explained, require_truths
 
-__all__ = ["Hooked", "asked", "by_itself", "collective", "hooks_of", "is_collective", "of_user"]
+__all__ = [
+    "Hooked",
+    "Owned",
+    "asked",
+    "by_itself",
+    "collective",
+    "hooks_of",
+    "is_collective",
+    "of_user",
+]
 
 #: What tells the ranks of an object, one after the other.
 KNOWN_BY = ("comm", "mesh", "V", "function_space", "bodies", "particles", "problem")
 _COLLECTIVE, _OWN, _BY_ITSELF = "__collective__", "__own__", "__by_itself__"
+_HOOKS = "__hooks__"
 
 #: The ranks that are within this package together, innermost last; ``None``: in a user's code.
 _within: list[MPI.Comm | None] = []
@@ -177,7 +187,33 @@ def is_collective(thing: Any) -> bool:
     return hasattr(getattr(thing, "fget", thing), _COLLECTIVE)
 
 
-class Hooked:
+class Owned:
+    """A class whose names stay its own where users derive from it, but for what heirs are to write.
+
+    That is all that stands in a class of this package made with ``hooks=True``. A method that is
+    not, or that a further class of this package has made its own, does what the rest needs: one
+    that an heir puts in its place must call it.
+    """
+
+    def __init_subclass__(cls, *, hooks: bool = False, **options: Any) -> None:
+        """Refuse what takes a name of this package's by chance.
+
+        Raises:
+            MPMError: A method takes the place of one that is no hook, and does not call it.
+        """
+        super().__init_subclass__(**options)
+        if is_ours(cls.__module__):
+            setattr(cls, _HOOKS, hooks)
+            return
+        for name, written in _written(cls):
+            if not _is_free(cls, name) and not _calls(written, name):
+                raise MPMError(
+                    f"{cls.__name__}.{name} takes the place of what this package has by that name; "
+                    f"give it another one, or have it call super().{name}."
+                )
+
+
+class Hooked(Owned):
     """A class whose public methods and properties its heirs may override, for this package to ask.
 
     Where an heir outside of this package does, ranks agree after each call, and a truth that is a
@@ -190,7 +226,7 @@ class Hooked:
         if is_ours(cls.__module__):
             return
         hooks = hooks_of(cls)
-        for name, value in list(vars(cls).items()):
+        for name, value in list(_written(cls)):
             if name not in hooks:
                 continue
             whole = f"{cls.__name__}.{name}"
@@ -198,6 +234,39 @@ class Hooked:
                 setattr(cls, name, value.getter(_same_truth(asked(value.fget, whole), whole)))
             elif inspect.isfunction(value):
                 setattr(cls, name, asked(value, f"{whole}()"))
+
+
+def _written(cls: type) -> Iterator[tuple[str, Any]]:
+    """Yield what a user's class puts in the place of this package's, by name.
+
+    Besides its own that is what comes from classes that have nothing to do with this package.
+    """
+    users = [each for each in cls.__mro__ if not is_ours(each.__module__)]
+    for name in sorted({name for each in users for name in vars(each)}):
+        home = next(each for each in cls.__mro__ if name in vars(each))
+        replaces = any(name in vars(each) for each in cls.__mro__ if is_ours(each.__module__))
+        if name.startswith("__") or not replaces or home not in users:
+            continue
+        if home is cls or not issubclass(home, Owned):  # (another heir has been looked at)
+            yield name, vars(home)[name]
+
+
+def _is_free(cls: type, name: str) -> bool:
+    """Return whether heirs may replace what a class has from this package by a name.
+
+    A method is as its nearest class has it; an option that a hook has is one in all classes.
+    """
+    having = [each for each in cls.__mro__ if is_ours(each.__module__) and name in vars(each)]
+    value = vars(having[0])[name]
+    nearest = having if not callable(value) and not hasattr(value, "__get__") else having[:1]
+    return any(vars(each).get(_HOOKS, False) for each in nearest)
+
+
+def _calls(written: Any, name: str) -> bool:
+    """Return whether what stands in the place of a method calls it, as far as its code tells."""
+    function = getattr(written, "fget", None) or getattr(written, "__func__", written)
+    code = getattr(inspect.unwrap(function), "__code__", None)
+    return code is not None and name in code.co_names
 
 
 def _same_truth(function: Callable[[Any], Any], name: str) -> Callable[[Any], Any]:

@@ -12,13 +12,14 @@ import ufl
 from dolfinx import fem, mesh
 
 from ..meshes.quadrature import quadrature_rule, volume_ratio, with_hoop
+from ..parallel.boundary import Owned
 from .deletion import Deletion
 from .undeformed import Undeformed, reach_behind_axis
 
 __all__ = ["Domains", "behind_axis", "crossed"]
 
 
-class Domains:
+class Domains(Owned):
     """The cells of a body mesh as domains that a displacement deforms.
 
     What moves the domains is not known here.

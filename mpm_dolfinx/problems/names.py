@@ -9,6 +9,7 @@ from typing import Any
 
 from ..errors import MPMError
 from ..parallel.given import is_ours
+from ..system.hooks import Hooks
 
 __all__ = ["OwnNames"]
 
@@ -34,8 +35,9 @@ class OwnNames:
             taken = taken or any(name in each for our, each in classes if not our)
             ours.add(name)
         else:
-            taken = any(our and callable(each.get(name)) for our, each in classes)
-            taken = name in ours or (taken and not callable(value))
+            stands = [each[name] for our, each in classes if our and name in each]
+            method = all(callable(each) for each in stands) and callable(value)
+            taken = name in ours or (bool(stands) and not method and name not in vars(Hooks))
         if taken:
             raise MPMError(
                 f"The name '{name}' is one of this package's in a {type(self).__name__}; "

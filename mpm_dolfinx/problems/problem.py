@@ -26,7 +26,7 @@ from ..history import History, Step
 from ..io.files import as_path
 from ..io.series import Output
 from ..io.snapshot import Kept, spaces_of
-from ..parallel.boundary import Hooked, by_itself, collective
+from ..parallel.boundary import collective
 from ..parallel.garbage import Cleaner
 from ..parallel.given import is_number, is_ours, require_same
 from ..particles.field import ParticleField
@@ -41,6 +41,7 @@ from ..stepping.trial import Trial
 from ..structures.structure import Structure
 from ..system.conditions import force_at
 from ..system.field_equation import FieldEquation
+from ..system.hooks import Hooks
 from ..system.predictor import Predictor
 from ..system.reduced import ReducedSystem
 from ..system.release import Release
@@ -73,14 +74,14 @@ type Law = tuple[str, dict[str, Any]]
 """Name of a material, and its parameters: numbers, or indices and values of points."""
 
 
-class Problem(Hooked, OwnNames):
+class Problem(Hooks, OwnNames):
     """Find the displacement of particles at which forces balance, in load steps.
 
     What all problems have is here. Of what their bodies are made is told by
     :class:`ParticleProblem` in UFL, by :class:`QuasiStaticProblem` with materials, and by those
     through time. Each step's increment lives in the background space: ``d = d_n + T u``, residual
-    ``T^T R`` and tangent ``T^T J T``. A subclass that takes a name of an attribute of these for its
-    own is refused.
+    ``T^T R`` and tangent ``T^T J T``. A subclass that takes a name of these for its own is refused,
+    but for what heirs are to write.
 
     Args:
         particles: The body or bodies.
@@ -667,26 +668,6 @@ class Problem(Hooked, OwnNames):
 
     # -- What a problem with a material adds -----------------------------------------------
 
-    def smooth(self) -> bool:
-        """Return whether no history changes in the last residual, nor contact (collective).
-
-        Newton steps that let the residual grow are taken on trust then. A problem that overrides
-        :meth:`evaluate` or :meth:`commit` has a history, unless it says otherwise here.
-        """
-        own = type(self)
-        return own.evaluate is Problem.evaluate and own.commit is Problem.commit
-
-    @by_itself
-    def evaluate(self) -> MPMError | None:
-        """Update what the forms hold besides the displacement; return why that cannot be.
-
-        Called before each assembly with ``particles.displacement`` set. Must not change the
-        history. A ``ConvergenceError`` or ``DomainDistortionError`` refuses this displacement, and
-        smaller steps are tried; all else, returned or raised, ends the step. It may differ between
-        ranks.
-        """
-        return None
-
     def time_error(self, size: float) -> tuple[float | None, float | None]:
         """Return the error of a solved step by its duration, and the motion so far (collective).
 
@@ -712,44 +693,13 @@ class Problem(Hooked, OwnNames):
         load = [float(body.load.value) for body in self.bodies]
         require_same(self._comm, load=load, bcs=self.bcs, constants=self.built.constants)
 
-    def commit(self) -> None:
-        """Make the last evaluation the converged one."""
-
-    def end_step(self) -> None:
-        """Do what is to be done between two steps."""
-
-    def roll_back(self) -> None:
-        """Return to the last converged evaluation."""
-
     @property
     def points(self) -> list[MaterialPoints]:
         """The materials at the points of each body; none where the residual is all."""
         return self.built.points
 
-    #: Where arrays of :meth:`converged_state` live that do not say it; ``None``: they must.
-    history_at: ClassVar[str | None] = "cells"
-
     #: Whether :meth:`converged_state` has all data at points that forms hold.
     keeps_data: ClassVar[bool] = False
-
-    def converged_state(self) -> list[dict[str, Any]]:
-        """Return the history at the last converged step, for a checkpoint.
-
-        Returns:
-            One dictionary for each body: arrays ``(n, ...)`` of its owned particles by name, or
-            :class:`mpm_dolfinx.io.Column`, which says where they live. A problem that can be
-            split needs the latter.
-        """
-        return [{} for _ in self.bodies]
-
-    def set_converged_state(self, states: list[dict[str, NDArray[Any]]]) -> None:
-        """Make what :meth:`converged_state` once returned the history.
-
-        :meth:`roll_back` is called after it.
-
-        Args:
-            states: As returned there.
-        """
 
     def laws(self) -> list[list[Law]]:
         """Return the materials of each body, for a checkpoint to know them by."""

@@ -89,7 +89,7 @@ class Kinematics:
         return _difference(self.after, self.before)
 
 
-class Scheme(Hooked, ABC):
+class Scheme(Hooked, ABC, hooks=True):
     """A rule by which bodies move through a step in time; a subclass is a new one.
 
     Give an instance as ``scheme=`` to a :class:`DynamicProblem`.

@@ -21,9 +21,10 @@ from ..errors import MPMError
 from ..io.snapshot import Kept
 from ..parallel.boundary import Hooked, by_itself
 from ..particles.particles import Particles
+from .hooks import Hooks
 from .own import OwnUnknowns
 
-__all__ = ["Alternating", "Hooks", "Motion", "PointMaterial", "Term", "Transfer", "UserTerm"]
+__all__ = ["Alternating", "Motion", "PointMaterial", "Term", "Transfer", "UserTerm"]
 
 
 type Transfer = Callable[[Particles], PETSc.Mat]
@@ -74,7 +75,7 @@ class Alternating(Protocol):
         """
 
 
-class Term(Hooked):
+class Term(Hooked, hooks=True):
     """Something that acts on the nodes of one body or of several.
 
     The residual of a step is ``sum_b T_b^T r_b`` and its tangent ``sum_ab T_a^T K_ab T_b``, where
@@ -325,22 +326,6 @@ class Term(Hooked):
     def kept(self) -> Sequence[Kept]:
         """Return the objects that are saved with the term and move with the bodies."""
         return ()
-
-
-class Hooks(Protocol):
-    """Methods that a subclass of a problem class may override."""
-
-    def evaluate(self) -> MPMError | None:
-        """Update what the forms hold besides the displacement."""
-
-    def smooth(self) -> bool:
-        """Return whether no history changes in the last residual, nor contact."""
-
-    def commit(self) -> None:
-        """Make the last evaluation the converged one."""
-
-    def roll_back(self) -> None:
-        """Return to the last converged evaluation."""
 
 
 class UserTerm(Term):

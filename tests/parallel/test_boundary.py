@@ -19,7 +19,7 @@ import mpm_dolfinx as mpm
 from mpm_dolfinx import boundary, contact, io, plot
 from mpm_dolfinx.io import Column, Kept, fill, of_cells
 from mpm_dolfinx.materials import Fracture, Hencky, NeoHooke, VonMises
-from mpm_dolfinx.parallel.boundary import Hooked, collective, hooks_of, is_collective
+from mpm_dolfinx.parallel.boundary import Hooked, Owned, collective, hooks_of, is_collective
 from mpm_dolfinx.system.schemes import Euler
 
 PROBLEMS = (
@@ -67,14 +67,21 @@ def made(kind=mpm.QuasiStaticProblem, law=None, terms=lambda body: (), **options
 def failing(base, name):
     """Return an heir in which something fails on the last rank."""
 
-    def fail(self, *args):
-        if LAST:
-            raise ValueError("no table")
-        found = inspect.getattr_static(base, name)
-        return found.fget(self) if isinstance(found, property) else found(self, *args)
-
-    hook = property(fail) if isinstance(inspect.getattr_static(base, name), property) else fail
-    return type("Own", (base,), {name: hook})
+    made = {"base": base, "LAST": LAST}
+    exec(
+        f"class Own(base):\n"
+        f"    def {name}(self, *args):\n"
+        f"        if LAST: raise ValueError('no table')\n"
+        f"        return super().{name}(*args)\n"
+        if inspect.isfunction(inspect.getattr_static(base, name))
+        else f"class Own(base):\n"
+        f"    @property\n"
+        f"    def {name}(self):\n"
+        f"        if LAST: raise ValueError('no table')\n"
+        f"        return super().{name}\n",
+        made,
+    )
+    return made["Own"]
 
 
 @collective()
@@ -114,6 +121,65 @@ def test_each_hook_that_fails_on_one_rank_fails_on_all(base, name, monkeypatch):
     fails(lambda: ask(scenes.WORLD, thing, name), rf"Own\.{name}.* failed with ValueError: no")
 
 
+#: What heirs of a problem are to write, as docs/ufl-data.md has it, and docs/checkpoints.md.
+FOR_HEIRS = {"evaluate", "commit", "roll_back", "smooth", "end_step", "history_at"}
+FOR_HEIRS |= {"converged_state", "set_converged_state"}
+OWNED = public(lambda c: inspect.isclass(c) and issubclass(c, Owned) and c is not mpm.Problem)
+
+
+def refused(make):
+    try:
+        make()
+    except mpm.MPMError as error:
+        return "takes the place of what this package has" in str(error)
+    return False
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("base", OWNED, ids=lambda c: c.__name__)
+def test_a_name_of_this_package_is_refused_to_a_method_that_does_not_call_it(base):
+    ours = [c for c in base.__mro__ if c.__module__.startswith("mpm_dolfinx")]
+    names = {name: c for c in reversed(ours) for name in vars(c) if not name.startswith("__")}
+    names = {name: c for name, c in names.items() if not name.startswith("_abc_")}
+    if issubclass(base, mpm.Problem):
+        free = {name for name in FOR_HEIRS if names[name].__name__ == "Hooks"} | {"history_at"}
+    else:
+        owners = (mpm.Term, io.Kept, mpm.Scheme)
+        free = {name for name, c in names.items() if c in owners}
+        free |= {n for n in names for c in owners if n in vars(c) and not is_code(base, n)}
+    for name in names:
+        foreign = type("Foreign", (), {name: lambda *_: None})
+        for heir in ((base,), {name: lambda *_: None}), ((foreign, base), {}):
+            assert refused(lambda heir=heir: type("Own", *heir)) == (name not in free), name
+        assert not refused(lambda: type("Own", (base, foreign), {})), name
+        assert not refused(lambda: extending(base, name)), name
+        assert not refused(lambda: type("Another", (extending(base, name),), {})), name
+    assert names
+
+
+def is_code(cls, name):
+    value = inspect.getattr_static(cls, name)
+    return callable(value) or hasattr(value, "__get__")
+
+
+def extending(base, name):
+    made = {"base": base}
+    exec(
+        f"class Own(base):\n    def {name}(self, *args):\n        return super().{name}(*args)",
+        made,
+    )
+    return made["Own"]
+
+
+def test_what_a_class_of_a_user_stands_for_is_told():
+    message = r"Clay.pressure takes .* give it another one, or have it call super\(\).pressure"
+    with pytest.raises(mpm.MPMError, match=message):
+
+        class Clay(mpm.QuasiStaticProblem):
+            def pressure(self):
+                return 5.0
+
+
 def run(problem):
     problem.solve(2)
     problem.summary()
@@ -141,7 +207,7 @@ def test_a_term_that_fails_on_one_rank_in_a_run(name):
     error = fails(lambda: REACHED[name](build), rf"Own\.{name}.* failed with ValueError: no table")
     if LAST:  # whose own error and where it was raised are not lost
         frames = traceback.extract_tb(error.__cause__.__traceback__)
-        assert type(error.__cause__) is ValueError and frames[-1].name == "fail"
+        assert type(error.__cause__) is ValueError and frames[-1].name == name
 
 
 def test_the_last_converged_state_is_whole_after_a_hook_failed_on_one_rank():

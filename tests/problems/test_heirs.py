@@ -232,3 +232,5 @@ def test_methods_may_be_replaced_and_other_names_are_free():
     problem.commit, problem.mine = lambda: called.append(1), 3
     problem.step()
     assert called == [1] and problem.mine == 3
+    with pytest.raises(mpm.MPMError, match="'at_rest' is one of this package's"):
+        problem.at_rest = 0.5  # (an earth pressure, as a user may mean it)
