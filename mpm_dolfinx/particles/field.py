@@ -100,6 +100,10 @@ class ParticleField(fem.Function):
             values = np.einsum("qk,nki->nqi", shapes, values)
         return np.asarray(values[..., 0] if block == 1 else values)
 
+    def from_nodes(self) -> fem.Function | None:
+        """Return itself if it has values all over the body, ``None`` if only points have them."""
+        return self if self.at == "nodes" else None
+
     @collective("values")
     def set(self, values: Any) -> None:
         """Set present and converged values, before the first step.

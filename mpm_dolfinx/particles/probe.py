@@ -31,10 +31,11 @@ def probe(particles: Particles, points: Any, field: str = "displacement") -> NDA
     Args:
         particles: The body.
         points: Undeformed coordinates, shape ``(m, gdim)`` or ``(gdim,)``.
-        field: ``"displacement"``, or ``"position"``, both interpolated within the domain of a
-            point; or a name in ``particles.fields()``, as ``"stress"``, ``"plastic_strain"``,
-            ``"pore_pressure"``: the value of the particle whose domain has the point, that of the
-            first of them between several.
+        field: ``"displacement"``, ``"position"``, or an unknown at nodes such as the
+            ``"pore_pressure"`` of a :class:`PorousProblem`, all interpolated within the domain of
+            a point; or a name in ``particles.fields()``, as ``"stress"``, ``"plastic_strain"``:
+            the mean over the domain of the particle that has the point, the first of them
+            between several.
 
     Returns:
         Values, shape ``(m, ...)``; of a single point without the first index.
@@ -100,15 +101,15 @@ def _values(
     particles: Particles, field: str, points: NDArray[np.float64], cells: NDArray[np.int32]
 ) -> NDArray[np.float64]:
     """Return this rank's values at points in space, zeros at those of others."""
-    mine = cells >= 0
-    if field in ("displacement", "position"):
-        gdim = particles.mesh.geometry.dim
-        values = np.zeros((len(points), gdim))
+    mine, functions = cells >= 0, particles.functions()
+    of = "displacement" if field == "position" else field
+    if of in functions:
+        shape = functions[of].ufl_shape
+        values = np.zeros((len(points), *shape))
         if mine.any():
-            moved = particles.displacement.eval(points[mine], cells[mine])
-            values[mine] = moved.reshape(-1, gdim)
+            values[mine] = functions[of].eval(points[mine], cells[mine]).reshape(-1, *shape)
         if field == "position":
-            values[mine] += points[mine, :gdim]
+            values[mine] += points[mine, : particles.mesh.geometry.dim]
         return values
     fields = particles.fields()
     if field not in fields:

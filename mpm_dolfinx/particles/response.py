@@ -10,6 +10,8 @@ from typing import Protocol, override
 import numpy as np
 from numpy.typing import NDArray
 
+from dolfinx import fem
+
 from ..errors import MPMError
 from .deletion import Deletion
 from .domains import Domains
@@ -65,6 +67,9 @@ class Unknown(Protocol):
 
     def at_points(self) -> NDArray[np.float64]:
         """Return its values at the points, shape ``(n, nq, ...)``."""
+
+    def from_nodes(self) -> fem.Function | None:
+        """Return what has its values all over the domains; ``None`` if only points have them."""
 
 
 class MaterialDomains(Domains):
@@ -205,6 +210,12 @@ class MaterialDomains(Domains):
         if self.deletion is not None:
             values["deleted"] = self.deleted.astype(np.float64)
         return values
+
+    def functions(self) -> dict[str, fem.Function]:
+        """Return the fields that have values all over the domains, by name."""
+        known = {one.name: one.from_nodes() for one in (*self._unknowns, *self._water)}
+        found = {name: one for name, one in known.items() if one is not None}
+        return {"displacement": self.displacement, **found}
 
     def _answering(self, what: str) -> Response:
         if self._response is None:

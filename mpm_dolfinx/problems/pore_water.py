@@ -42,6 +42,9 @@ class Excess:
         """Return it at the last converged step, shape ``(n, nq)``."""
         return self._points.last.variable(EXCESS)
 
+    def from_nodes(self) -> None:
+        """Return nothing: it is known at points."""
+
 
 class PoreWater:
     """All of the pore pressure of a body.
@@ -76,6 +79,9 @@ class PoreWater:
             values = self._known.eval(body.mesh, np.arange(body.num_local, dtype=np.int32))
             found += float(body.load.value) * np.asarray(values).reshape(found.shape)
         return found if self._excess is None else found + self._excess.at_points()
+
+    def from_nodes(self) -> None:
+        """Return nothing: it is known at points."""
 
 
 def water_in(particles: Particles, known: Any, points: MaterialPoints) -> list[PoreWater | Excess]:

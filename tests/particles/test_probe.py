@@ -71,6 +71,36 @@ def test_a_field_is_that_of_the_particle_there():
     assert np.allclose(mpm.probe(particles, every, "volume_ratio"), expected, rtol=1e-14)
 
 
+def test_the_pore_pressure_along_a_line():
+    """It is that of the nodes, continuous, and nothing where water drains: no stairs of domains."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [1.0, 1.25], [2, 5], CELLS[2]), 2)
+    column = scenes.box([0.0, 0.0], [1.0, 1.0], [2, 8], CELLS[2])
+    particles = mpm.Particles(column, V, degree=2)
+    tags = mpm.facet_tags(column, {1: mpm.region(y=1.0)})
+    problem = mpm.PorousProblem(
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(10.0, 0.0),
+            tractions=[((0.0, -3.0), 1)],
+            facet_tags=tags,
+            pore_fluid=mpm.PoreFluid(0.1, drained=[(0.0, 1)]),
+        ),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=1.0), mpm.held(V, 1, y=0.0)],
+    )
+    problem.step(0.1)
+    field = problem.pore_pressure[0]
+    at = field.W.tabulate_dof_coordinates()
+    own = np.flatnonzero(abs(at[: field.W.dofmap.index_map.size_local, 0] - 0.5) < 1e-9)
+    comm = column.comm
+    x = np.concatenate(comm.allgather(at[own, :2]))
+    p = mpm.probe(particles, x, "pore_pressure")
+    assert len(x) == 9 and p.shape == (9,) and p.min() >= -1e-3 < 2.5 < p.max()
+    assert np.allclose(p, np.concatenate(comm.allgather(field.x.array[own])), rtol=1e-12)
+    assert abs(p[np.argmax(x[:, 1])]) < 0.03 * p.max()  # where it drains, in the sense of Nitsche
+    one = mpm.probe(particles, (0.5, 0.5), "pore_pressure")
+    assert one.shape == () and np.allclose(one, p[np.argmin(abs(x[:, 1] - 0.5))])
+
+
 def test_what_cannot_be_asked():
     particles, problem = bar()
     problem.solve(steps=1)
