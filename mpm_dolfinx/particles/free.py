@@ -46,6 +46,9 @@ class FreeNodes:
         locate: As given.
         automatic: As given.
         increment: Their increment in the step being solved.
+        led: How far each node has gone with held dofs of the background that move: a free one goes
+            on to follow them from where that began, although the background stays where it is.
+        bound: Which nodes have gone, or go, with such dofs; ghosts too.
         chosen: Which of this rank's nodes of W are free, ghosts too.
         spent: Which have been free until the domains around them were bad, and stay carried.
     """
@@ -58,11 +61,12 @@ class FreeNodes:
         self.particles, self.locate, self.automatic = particles, locate, automatic
         self.V = self.W = particles.W
         self.increment = fem.Function(self.W, name="increment of free nodes")
-        self._beneath: PointBasis | None = None
+        self.led = fem.Function(self.W, name="displacement with held dofs")
+        self._background: PointBasis | None = None
         layout = self.W.dofmap.index_map
         local = np.arange(layout.size_local + layout.num_ghosts, dtype=np.int32)
         self._nodes: NDArray[np.int64] = layout.local_to_global(local)
-        self.chosen, self.spent = (np.zeros(len(local), dtype=bool) for _ in range(2))
+        self.chosen, self.spent, self.bound = (np.zeros(len(local), dtype=bool) for _ in range(3))
         self._dead = np.zeros(len(local), dtype=bool)
         self._basis: PointBasis | None = None
         self._T: PETSc.Mat | None = None
@@ -83,8 +87,8 @@ class FreeNodes:
             rows: The background basis at the local nodes of W.
         """
         free = self.chosen
-        there = (free & rows.found)[:, None]
-        self._beneath = PointBasis(rows.nodes, np.where(there, rows.values, 0.0), rows.found)
+        values = np.where(rows.found[:, None], rows.values, 0.0)
+        self._background = PointBasis(rows.nodes, values, rows.found)
         rows.values[free] = 0.0
         rows.found[free] = True
         self._basis = self._T = None
@@ -99,10 +103,29 @@ class FreeNodes:
         self._basis = self._T = None
 
     @property
+    def background(self) -> PointBasis:
+        """The rows that the local nodes would have if all were carried: zero off the background."""
+        assert self._background is not None
+        return self._background
+
+    @property
     def beneath(self) -> PointBasis:
-        """The rows that the local free nodes would have: zero off the background, and of others."""
-        assert self._beneath is not None
-        return self._beneath
+        """The same of free nodes: zero for others."""
+        return self._of_free(self.background)
+
+    def _of_free(self, rows: PointBasis) -> PointBasis:
+        """Return rows that are zero for nodes that are carried."""
+        return rows._replace(values=np.where(self.chosen[:, None], rows.values, 0.0))
+
+    def bind(self, own: NDArray[np.bool_]) -> None:
+        """Say which own dofs of W follow held dofs that move, or have moved (collective)."""
+        bs = self.W.dofmap.index_map_bs
+        self.bound = chosen_nodes(self.W, np.flatnonzero(own.reshape(-1, bs).any(axis=1)))
+
+    @property
+    def are_led(self) -> NDArray[np.bool_]:
+        """Which local nodes have gone with held dofs of the background."""
+        return np.asarray(self.led.x.array.reshape(len(self.chosen), -1).any(axis=1))
 
     @property
     def dofs(self) -> NDArray[np.bool_]:

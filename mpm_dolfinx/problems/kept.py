@@ -66,6 +66,8 @@ def _columns_of(body: Particles) -> dict[str, Column]:
     if body.free_nodes is not None:
         state = body.free_nodes.chosen.astype(np.float64) - body.free_nodes.spent
         columns["free"] = Column(state[body.domain_nodes], "nodes")
+        led = body.free_nodes.led.x.array.reshape(len(state), -1)
+        columns["led"] = Column(led[body.domain_nodes], "nodes")
     if body.deletion is not None:
         columns["deleted"] = Column(body.deletion.mask, "cells")
         columns["kept"] = Column(body.deletion.kept(nodal), "nodes")
@@ -87,6 +89,9 @@ def _restore_body(body: Particles, columns: dict[str, NDArray[Any]]) -> None:
         states = (columns["free"] > 0.5, columns["free"] < -0.5)
         nodes = (np.unique(body.domain_nodes[state]) for state in states)
         placement.choose_free(*(chosen_nodes(body.W, some) for some in nodes))
+        led = body.free_nodes.led.x
+        led.array.reshape(-1, body.geometry.gdim)[body.domain_nodes] = columns["led"]
+        led.scatter_forward()
     if body.deletion is not None:
         placement.restore_deleted(columns["deleted"], columns["kept"])
     if undeformed.mass_share is not None:

@@ -36,7 +36,8 @@ class Adaptivity:
     What the background errs by is the sum of what it does at each node that it carries; the rest is
     the error of the bodies' own elements, on which no choice of nodes has an influence. Both
     together are to be at most the tolerance; or, where the rest is more than that, the background's
-    part a small one. The fewest nodes are taken that have most of what is too much.
+    part a small one. The fewest nodes are taken that have most of what is too much, with those that
+    held dofs lead.
 
     Args:
         tolerance: Error allowed, relative to the deformation, in energy.
@@ -87,8 +88,11 @@ class Adaptivity:
         found = []
         for body, can, error in zip(bodies, every, errors.nodal, strict=True):
             if can is not None:
-                wanted = np.flatnonzero(can[: len(error)] & (error >= (1.0 - SMALL) * least))
-                found.append((body, body.free | chosen_nodes(body.W, wanted)))
+                wanted = can[: len(error)] & (error >= (1.0 - SMALL) * least)
+                assert body.free_nodes is not None
+                bound = body.free_nodes.bound & can  # (which the background lets slip)
+                more = bound | chosen_nodes(body.W, np.flatnonzero(wanted))
+                found.append((body, body.free | more))
         return found
 
     def complaint(self, found: float) -> str | None:

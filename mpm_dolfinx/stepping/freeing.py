@@ -113,16 +113,18 @@ def carried_after(bodies: Sequence[Particles]) -> Carried:
 
     They are those of domains that are distorted, or will be if the next step is like this one, and
     those that are about to leave the background, with all that the background moves together with
-    them: a node that it carries alone is as free as before. What is carried stays so.
+    them: a node that it carries alone is as free as before. What is carried stays so. Nodes that
+    held dofs lead stay free: the background does not go along, and would let go of them.
 
     Args:
         bodies: Those with nodes that are free as long as domains are good, not yet committed.
     """
     found, too_late = [], False
     for body in bodies:
-        if not _any(body, body.free):
+        free = _loose(body)
+        if not _any(body, free):
             continue
-        free, moved = body.free, body.displacement.x.array.reshape(len(body.free), -1)
+        moved = body.displacement.x.array.reshape(len(body.free), -1)
         before = body.node_positions
         after = before + moved - body.converged_displacement.reshape(moved.shape)
         ahead = 2.0 * after - before
@@ -153,7 +155,7 @@ def relieve(bodies: Sequence[Particles], error: MPMError) -> Carried:
         named = np.isin(body.global_index, error.particles)
         seeds = np.zeros(len(body.free), dtype=bool)
         seeds[body.domain_nodes[named]] = True
-        if (rest := _without(body, seeds & body.free, body.node_positions)) is not None:
+        if (rest := _without(body, seeds & _loose(body), body.node_positions)) is not None:
             found.append((body, rest))
     return Carried(found, False)
 
@@ -169,6 +171,12 @@ def bad_nodes(body: Particles, positions: NDArray[np.float64]) -> NDArray[np.boo
     quality = body.geometry.quality(positions[body.domain_nodes])
     bad[body.domain_nodes[(quality < LEAST_QUALITY) & ~body.deleted]] = True
     return bad
+
+
+def _loose(body: Particles) -> NDArray[np.bool_]:
+    """Return the local free nodes but for those that go with held dofs of the background."""
+    assert body.free_nodes is not None
+    return body.free & ~body.free_nodes.bound
 
 
 def _any(body: Particles, mask: NDArray[np.bool_]) -> bool:
@@ -201,7 +209,7 @@ def _without(
     T.multTranspose(one, together)
     T.mult(together, one)
     moved = (one.array_r > 0.0).reshape(-1, bs).any(axis=1)
-    carried = chosen_nodes(body.W, np.flatnonzero(moved)) & body.free
+    carried = chosen_nodes(body.W, np.flatnonzero(moved)) & _loose(body)
     for thing in (T, one, together):
         thing.destroy()
     return body.free & ~carried if _any(body, carried) else None

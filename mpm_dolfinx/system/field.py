@@ -224,6 +224,9 @@ class Field:
             if body.mover.basis.hold(at_rest):
                 body.forget_transfer()
 
+    def end(self) -> None:
+        """Take note of a converged step, with whose values bodies have moved."""
+
     # -- Unknowns -------------------------------------------------------------------------
 
     def find(self) -> FreeDofs:

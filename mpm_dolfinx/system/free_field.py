@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..assembly.blocks import Restriction
+from ..background.basis import PointBasis
 from ..errors import MPMError, agree
 from ..parallel.totals import over_ranks
 from ..particles.field import CarriedField
@@ -32,8 +33,9 @@ __all__ = ["FreeField", "Subspace"]
 class FreeField(Field):
     """The free nodes of a body as a field: its space is W, its unknowns are their dofs.
 
-    A component of a free node that the background would carry by held dofs alone follows these, as
-    a carried one does, and what holds it counts as a reaction of theirs. All calls are collective.
+    A component of a free node that the background would carry by held dofs alone follows these, and
+    what holds it counts as a reaction of theirs. Where they move it goes with them, and follows
+    them as long as they are held, as nodes of finite elements do. All calls are collective.
 
     Args:
         nodes: The free nodes.
@@ -54,7 +56,7 @@ class FreeField(Field):
         super().__init__([nodes], conditions)
         self.nodes, self.host = nodes, host
         self._beneath: PETSc.Mat | None = None
-        self._followers = np.zeros(self._owned, dtype=bool)
+        self._followers, self._bound = (np.zeros(self._owned, dtype=bool) for _ in range(2))
         self._held()
 
     def _held(self) -> NDArray[np.bool_]:
@@ -80,33 +82,82 @@ class FreeField(Field):
     @override
     def held_now(self) -> NDArray[np.bool_]:
         fixed, held = self._held(), self.host.held_now()
-        self._followers = np.zeros(self._owned, dtype=bool)
+        self._followers, self._bound = (np.zeros(self._owned, dtype=bool) for _ in range(2))
         self._beneath = None
-        if not over_ranks(self._comm, bool(held.any()), MPI.LOR):
-            return fixed
-        self.nodes.locate()
-        rows = self.nodes.beneath
+        if over_ranks(self._comm, bool(held.any()), MPI.LOR):
+            self._follow(held, fixed)
+        self.nodes.bind(self._bound)
+        return fixed | self._followers
+
+    def _follow(self, held: NDArray[np.bool_], fixed: NDArray[np.bool_]) -> None:
+        """Find own dofs of W that follow held ones of the background (collective).
+
+        Args:
+            held: Own dofs of V that are held.
+            fixed: Own dofs of W that are held by themselves.
+        """
+        nodes = self.nodes
+        nodes.locate()
+        led = over_ranks(self._comm, bool(nodes.are_led.any()), MPI.LOR)
+        moving = led or self.host.prescribed.changes
+        rows = nodes.background if moving else nodes.beneath
+        first = self._where_held() if led else rows
+        whole, _ = self._holds(first, held)
+        free = nodes.dofs
+        if led:  # of carried ones, only what is not out of reach by now
+            whole &= free | self._holds(rows, held)[1]
+        self._followers = whole & free & ~fixed
+        if not over_ranks(self._comm, bool(whole.any()), MPI.LOR):
+            return
+        self._beneath = transfer_matrix(first, self.V, self.host.V)
+        if moving:
+            before = nodes.led.x.array[: self._owned]
+            self._bound = whole & ((before != 0.0) | (self._lifts() != 0.0))
+
+    def _where_held(self) -> PointBasis:
+        """Return rows of the background, for nodes that are led where that began (collective)."""
+        body, rows = self.motions[0].particles, self.nodes.background
+        led = np.flatnonzero(self.nodes.are_led)
+        gone = self.nodes.led.x.array.reshape(-1, self._bs)[led]
+        before = body.mover.basis.within(body.node_positions[led] - gone)
+        first = PointBasis(rows.nodes.copy(), rows.values.copy(), rows.found.copy())
+        first.nodes[led], first.values[led], first.found[led] = before[:3]
+        return first
+
+    def _holds(
+        self, rows: PointBasis, held: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which own dofs of W held dofs of V carry, wholly or in part (collective)."""
         sizes = transfer_matrix(rows._replace(values=np.abs(rows.values)), self.V, self.host.V)
-        whole, loose = (sizes.createVecLeft() for _ in range(2))
-        weights = sizes.createVecRight()
+        weights, every, loose = sizes.createVecRight(), *(sizes.createVecLeft() for _ in range(2))
         weights.set(1.0)
-        sizes.mult(weights, whole)
+        sizes.mult(weights, every)
         weights.array_w[held] = 0.0
         sizes.mult(weights, loose)
-        self._followers = (whole.array_r > 0.0) & (loose.array_r == 0.0) & ~fixed
-        if over_ranks(self._comm, bool(self._followers.any()), MPI.LOR):
-            self._beneath = transfer_matrix(rows, self.V, self.host.V)
-        return fixed | self._followers
+        whole = (every.array_r > 0.0) & (loose.array_r == 0.0)
+        return whole, np.asarray(loose.array_r < every.array_r)
+
+    def _lifts(self) -> NDArray[np.float64]:
+        """Return how the change of held dofs of the background moves own dofs of W (collective)."""
+        assert self._beneath is not None
+        given, taken = self._beneath.createVecs()
+        given.array_w[:] = self.host.changes()
+        self._beneath.mult(given, taken)
+        return np.asarray(taken.array_r)
 
     @override
     def changes(self) -> NDArray[np.float64]:
         lifts = super().changes()
         if self._beneath is not None:
-            given, taken = self._beneath.createVecs()
-            given.array_w[:] = self.host.changes()
-            self._beneath.mult(given, taken)
-            lifts[self._followers] = taken.array_r[self._followers]
+            lifts[self._followers] = self._lifts()[self._followers]
         return lifts
+
+    @override
+    def end(self) -> None:
+        led = self.nodes.led.x
+        own = led.array[: self._owned]
+        own[:] = np.where(self._bound, own + self.motions[0].increment(), 0.0)
+        led.scatter_forward()
 
     def add_followed(self, forces: PETSc.Vec) -> bool:
         """Add the last forces on what follows held dofs of the background to those on these.

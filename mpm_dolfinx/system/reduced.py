@@ -177,6 +177,8 @@ class ReducedSystem:
             again: Whether it was the step before that was solved on, with more unknowns.
         """
         self.unknowns.forget()
+        for field in self.fields:
+            field.end()
         self.predictor.record(self._step.size, self.unknowns.increments(), again)
         for own in self.unknowns.own:
             own.record(self._step.size, again)

@@ -288,6 +288,33 @@ def test_a_path_and_a_stage():
     assert (own.free >= before).all()
 
 
+@pytest.mark.parametrize("slipped", [0.0, 0.04])
+def test_nodes_that_a_moving_side_of_the_background_leads_do_not_come_loose(slipped):
+    """The side is a line of the background, which stays there; carried nodes slip beside it."""
+    rises = []
+    for free in (None, [], "elements"):
+        V = vectors(box([-0.5, -0.5], [2.0, 1.0], [10, 6], QUADRILATERAL))
+        body = box([0.0, 0.0], [1.0, 0.5], [8, 4], QUADRILATERAL)
+        if free == "elements":
+            own = mpm.Particles(body)
+        else:
+            own = mpm.Particles(body, V, free=free, quadrature_degree=2)
+        pull = fem.Constant(own.V.mesh, np.zeros(2))
+        end = mpm.held(own.V, x=1.0, value=pull)
+        problem = mpm.QuasiStaticProblem(
+            mpm.Body(own, Hencky(1e3, 0.3)), bcs=[mpm.held(own.V, x=0.0), end]
+        )
+        if slipped:
+            problem.solve(2, update=lambda t, pull=pull: pull.value.put(0, slipped * t))
+        path = lambda t, pull=pull: pull.value.put(0, slipped + 0.08 * t)  # noqa: E731
+        adapt = {"adapt": 0.07} if free == [] else {}
+        forces = [problem.reaction(end)[0] for _ in problem.steps(4, update=path, **adapt)]
+        rises.append(np.diff(forces))
+    carried, adapted, elements = rises
+    assert np.abs(adapted / elements - 1.0).max() < 0.05
+    assert slipped or np.abs(carried / elements - 1.0).max() > 0.1
+
+
 def test_several_bodies_and_contact():
     """Only bodies that were made so have nodes freed; finite elements bear on one of them."""
     ground = box([0.0, 0.0], [2.0, 1.0], [16, 8], QUADRILATERAL)

@@ -100,6 +100,62 @@ def test_conditions_on_the_background_hold_free_nodes_too():
     assert np.abs(np.array(forces) - its).max() < 1e-9 * np.abs(forces).max()
 
 
+@pytest.mark.parametrize("free", [every, "auto", right], ids=["every", "auto", "right"])
+@pytest.mark.parametrize("kind", [mpm.QuasiStaticProblem, mpm.DynamicProblem])
+@pytest.mark.filterwarnings("ignore:Time steps of")
+def test_held_dofs_of_the_background_lead_free_nodes_over_steps(kind, free, mpi_tmp_path):
+    """They go on to follow what holds them, to and fro, off the lines where that is, and let go.
+
+    On their way they leave the background, come from a checkpoint and to other ranks.
+    """
+
+    def made(free):
+        mesh = body_in(QUADRILATERAL, 3)
+        V = scenes.vectors(scenes.box([-0.4, -0.25], [1.2, 0.75], [8, 4], QUADRILATERAL))
+        if free is None:
+            own = mpm.Particles(mesh)
+        else:
+            own = mpm.Particles(mesh, V, free=free, quadrature_degree=2)
+        pull = fem.Constant(own.V.mesh, 0.0)
+        law = VonMises(YOUNG, POISSON, rho_y=60.0, hardening=100.0)
+        ends = [mpm.held(own.V, 0, x=1.0, value=pull), mpm.held(own.V, 1, y=0.0)]
+        problem = kind(
+            mpm.Body(own, law, density=100.0, tractions=[((2.0, 0.0), 1)], facet_tags=top(mesh)),
+            bcs=[mpm.held(own.V, 0, x=0.0), *ends],
+            solver=mpm.Solver(petsc_options={"snes_rtol": 1e-11}),
+        )
+        return problem, pull
+
+    def top(mesh):
+        return scenes.facet_tags(mesh, at(1, 0.5))
+
+    def run(problem, pull, until):
+        path = lambda t: setattr(pull, "value", 0.25 * np.sin(2.0 * t))  # noqa: E731
+        if kind is mpm.DynamicProblem:
+            problem.solve(time=until, dt=0.25, update=path)
+        else:
+            start = until - 1.0
+            problem.solve(4, update=lambda t: path(start + t))
+        return scenes.in_order(problem.particles, problem.particles.centroid)
+
+    runs = []
+    for nodes in (None, free):
+        problem, pull = made(nodes)
+        run(problem, pull, 1.0)
+        if nodes is not None:
+            problem.save(mpi_tmp_path / "state")
+            problem, pull = made(nodes)
+            pull.value = 0.25 * np.sin(2.0)
+            problem.restore(mpi_tmp_path / "state")
+            problem.repartition(0.0)
+        led, force = run(problem, pull, 2.0), problem.reaction(problem.bcs[1])
+        problem.stage("let go", bcs=[problem.bcs[0], problem.bcs[2]])
+        runs.append((led, force, run(problem, pull, 3.0)))
+    for mine, other in zip(*runs, strict=True):
+        gap = np.abs(mine - other).max() / np.abs(mine).max()
+        assert gap < 1e-8 if free is not right else 1e-8 < gap < 0.1
+
+
 @pytest.mark.parametrize("degree", [1, 2])
 def test_equilibrium_in_the_larger_space_is_that_of_dense_algebra(degree):
     mesh = body_in(QUADRILATERAL, 3)
