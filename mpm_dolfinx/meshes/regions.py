@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from dolfinx import fem, mesh
 
+from .. import _compat
 from ..errors import MPMError, agree, as_ours
 from ..parallel.boundary import collective
-from ..reals import as_reals
+from ..reals import as_reals, as_wholes
 from ..tolerances import NEGLIGIBLE
 
-__all__ = ["cell_tags", "facet_tags", "held", "in_space", "marked", "region"]
+__all__ = ["cell_tags", "facet_tags", "held", "in_space", "marked", "region", "tagged"]
 
 type Where = Callable[[NDArray[np.float64]], Any]
 
@@ -65,9 +66,7 @@ def region(
 
     def inside(points: NDArray[np.float64]) -> NDArray[np.bool_]:
         places = np.asarray(points, dtype=np.float64)
-        sizes = [np.abs(places).max(initial=0.0)]
-        sizes += [abs(b) for bound in bounds if bound is not None for b in bound if np.isfinite(b)]
-        near = NEGLIGIBLE * max(sizes)
+        near = NEGLIGIBLE * np.abs(places).max(initial=0.0)
         found = np.ones(places.shape[1], dtype=bool)
         for along, bound in zip(places, bounds, strict=False):
             if bound is not None:
@@ -108,6 +107,32 @@ def marked(where: Where, points: NDArray[np.float64], what: str) -> NDArray[np.b
             f"not an array of shape {inside.shape} and type {inside.dtype}."
         )
     return inside.astype(np.bool_)
+
+
+def tagged(where: tuple[mesh.MeshTags, Any], domain: mesh.Mesh, name: str) -> NDArray[np.int32]:
+    """Return the local cells of a mesh that have a tag, or one of several.
+
+    Args:
+        where: Tags of the cells, and the tag or tags.
+        domain: The mesh.
+        name: Name of the argument.
+
+    Raises:
+        MPMError: Tags of something else, or a tag that is no whole number.
+    """
+    tags, wanted = where
+    if tags.dim != domain.topology.dim or not _compat.are_tags_of(tags, domain):
+        raise MPMError(
+            f"The tags in {name}=(tags, tag) must be those of cells of the present body mesh, "
+            "particles.mesh; particles.carry() takes older ones over to it."
+        )
+    try:
+        values = as_wholes(wanted).ravel()
+    except (TypeError, ValueError):
+        raise MPMError(
+            f"The tag in {name}=(tags, tag) is a whole number, or several, not {wanted!r}."
+        ) from None
+    return np.asarray(tags.indices[np.isin(tags.values, values)])
 
 
 def _bounds(name: str, value: Any) -> tuple[float, float] | None:

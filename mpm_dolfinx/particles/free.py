@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from dolfinx import fem, la, mesh
 
-from .. import _compat
 from ..background.basis import PointBasis
 from ..errors import MPMError, agree
-from ..meshes.regions import marked
+from ..meshes.regions import marked, tagged
 from ..parallel.given import require_same
 from ..reals import as_wholes
 from ..transfer.matrix import transfer_matrix
@@ -220,15 +219,4 @@ def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
             "free= is 'auto', a function of coordinates such as mpm.region(...), (cell tags, tag), "
             f"or a list of local nodes of W, not {where!r}."
         )
-    tags, wanted = where
-    body = W.mesh
-    if tags.dim != body.topology.dim or not _compat.are_tags_of(tags, body):
-        raise MPMError("The tags in free=(tags, tag) must be those of cells of the body mesh.")
-    try:
-        values = as_wholes(wanted).ravel()
-    except (TypeError, ValueError):
-        raise MPMError(
-            f"The tag in free=(tags, tag) is a whole number, or several, not {wanted!r}."
-        ) from None
-    cells = tags.indices[np.isin(tags.values, values)]
-    return np.unique(W.dofmap.list[cells])
+    return np.unique(W.dofmap.list[tagged(where, W.mesh, "free")])

@@ -48,8 +48,20 @@ class Answers(Protocol):
         """Return the accumulated plastic strain, shape ``(n, nq)``."""
 
 
+class Laws(Protocol):
+    """Materials of a body's points."""
+
+    @property
+    def has_small_strain(self) -> NDArray[np.bool_]:
+        """Which points have a law of small strains, shape ``(n nq,)``."""
+
+
 class Response(Protocol):
     """Material at the points of a body."""
+
+    @property
+    def laws(self) -> Laws:
+        """The materials."""
 
     @property
     def strain(self) -> Kinematics:
@@ -164,6 +176,11 @@ class MaterialDomains(Domains):
             return stress
         water = self._water[0].at_points()
         return np.asarray(stress - water[..., None, None] * np.eye(3))
+
+    @property
+    def has_small_strain(self) -> NDArray[np.bool_]:
+        """Which particles have a law of small strains, shape ``(n,)``."""
+        return self._answering("stress").laws.has_small_strain[:: self.num_points]
 
     @property
     def revolves(self) -> bool:

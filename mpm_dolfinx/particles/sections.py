@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,11 +17,11 @@ from dolfinx import mesh
 
 from ..errors import MPMError, agree
 from ..meshes.quadrature import nodal_forces, vector_product
-from ..meshes.regions import in_space, marked
+from ..meshes.regions import in_space, marked, tagged
 from ..parallel.boundary import collective
 from ..parallel.totals import over_ranks
-from ..reals import as_reals, as_wholes
-from ..tolerances import NEGLIGIBLE
+from ..reals import as_reals
+from ..tolerances import NEGLIGIBLE, SLIGHT
 from .particles import Particles
 
 __all__ = ["SectionForces", "section_forces"]
@@ -71,7 +73,9 @@ def section_forces(
 
     This is the work in a motion that is rigid beyond the section, and rests before it: free nodes
     have exactly the forces that are in equilibrium with what acts beyond, on any mesh and at any
-    rotation. The stress is the total one where there is water.
+    rotation; with ``f_bar=`` but for a share that falls with the square of cells' size. The stress
+    is the total one where there is water. Laws of small strains are in equilibrium in the
+    undeformed body, where their sections stay.
 
     Args:
         particles: The body that has the structure, or is it.
@@ -81,8 +85,8 @@ def section_forces(
             ``mpm.region(...)``, or a pair of cell tags and a tag; ``None``: all of the body.
 
     Raises:
-        MPMError: A body without a material or one of revolution, an axis that makes no sense, or
-            parts of it where the structure is not.
+        MPMError: A body without a material or one of revolution, an axis that makes no sense,
+            parts of it where the structure is not, or tags of another mesh than the present one.
     """
     comm, gdim = particles.mesh.comm, particles.mesh.geometry.dim
     with agree(comm):
@@ -95,12 +99,19 @@ def section_forces(
         cells = np.flatnonzero(_chosen(particles, where) & ~particles.deleted)
         sections = _Sections(particles, points, cells)
     area, moments, directions = (over_ranks(comm, part) for part in sections.measures())
+    missed = sections.missed(comm)
     with agree(comm):
         if (area <= NEGLIGIBLE * area.max()).any():
             i = int(np.argmin(area))
             raise MPMError(
                 f"The structure is not between points {i} and {i + 1} of axis=; give points along "
                 "its middle, and say by where= which cells it has."
+            )
+        if missed.max() > SLIGHT:
+            i = int(np.argmax(missed))
+            raise MPMError(
+                f"The structure does not reach from point {i} to {i + 1} of axis=; give points "
+                "along its middle that end where it does, or before."
             )
     centre = moments / area[:, None]
     along = directions / np.linalg.norm(directions, axis=1)[:, None]
@@ -123,19 +134,30 @@ class _Sections:
 
     def __init__(self, particles: Particles, points: Array, cells: NDArray[np.intp]) -> None:
         rule, gdim = particles.undeformed.rule, particles.geometry.gdim
-        self._nodes = particles.corners()[cells]
-        self._points = particles.points[cells]
-        self._F = particles.point_deformation_gradient[cells, :, :gdim, :gdim]
-        self._weights, self._gradients = rule.weights[cells], rule.gradients[cells]
         cauchy = particles.point_total_stress[cells, :, :gdim, :gdim]
-        ratio = np.linalg.det(particles.point_deformation_gradient[cells])
-        piola = ratio[..., None, None] * np.linalg.solve(self._F, cauchy).swapaxes(2, 3)
+        small = particles.has_small_strain[cells, None, None]
+        nodes = particles.initial_domains[cells]
+        self._nodes = np.where(small, nodes, particles.corners()[cells])
+        self._points = np.where(small, particles.initial_points[cells], particles.points[cells])
+        F = np.where(small[..., None], np.eye(3), particles.point_deformation_gradient[cells])
+        self._F = F[:, :, :gdim, :gdim]
+        self._weights, self._gradients = rule.weights[cells], rule.gradients[cells]
+        ratio = np.linalg.det(F)[..., None, None]
+        piola = ratio * np.linalg.solve(self._F, cauchy).swapaxes(2, 3)
         self._forces = nodal_forces(piola, self._weights, self._gradients, None)
         self._along = np.diff(points, axis=0) / _lengths(points)[:, None]
         self._cuts = []
-        for step in _steps(points, particles.initial_domains[cells]):
+        self._ends = []
+        for step in _steps(points, nodes):
             cut = np.flatnonzero(np.ptp(step, axis=1) > 0.0)
             self._cuts.append((cut, step[cut]))
+            self._ends.append((step.min(initial=1.0), 1.0 - step.max(initial=0.0)))
+
+    def missed(self, comm: MPI.Comm) -> Array:
+        """Return which share of each section's length is before or beyond all (collective)."""
+        ends = np.array(self._ends)
+        comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
+        return np.asarray(ends.max(axis=1))
 
     def measures(self) -> tuple[Array, Array, Array]:
         """Return areas, and their integrals of position and of the direction along the axis."""
@@ -185,14 +207,9 @@ def _chosen(particles: Particles, where: Any) -> NDArray[np.bool_]:
             "where= is a function of coordinates such as mpm.region(...), or (cell tags, tag), not "
             f"{where!r}."
         )
-    tags, wanted = where
-    try:
-        wanted = as_wholes(wanted)
-    except (TypeError, ValueError):
-        raise MPMError(f"The tags of where= are whole numbers, not {wanted!r}.") from None
-    mine = tags.indices < particles.num_local
     chosen = np.zeros(particles.num_local, dtype=bool)
-    chosen[tags.indices[mine]] = np.isin(tags.values[mine], wanted)
+    cells = tagged(where, particles.mesh, "where")
+    chosen[cells[cells < particles.num_local]] = True
     return chosen
 
 

@@ -18,6 +18,15 @@ def domain():
     return scenes.box([0.0, 0.0], [4.0, 3.0], [8, 6], QUADRILATERAL)
 
 
+def test_a_bound_far_away_does_not_move_the_other_one():
+    x = np.zeros((3, 5))
+    x[0] = [-1.0, 0.0, 1e-12, 1e-6, 0.5]
+    for far in (1e3, 1e9, np.inf):
+        assert mpm.region(x=(-far, 0.0))(x).tolist() == [True, True, True, False, False]
+        assert mpm.region(x=(0.0, far))(x).tolist() == [False, True, True, True, True]
+        assert mpm.region(x=(-1.0, 0.0), y=(-far, far))(x).tolist() == [True] * 3 + [False] * 2
+
+
 def test_points_of_regions():
     x = np.array([[0.0, 1.0, 2.0, 1.0, 5.0], [0.0, 0.5, 1.0, 2.0, 5.0], [0.0] * 5])
     assert mpm.region(x=1.0)(x).tolist() == [False, True, False, True, False]

@@ -149,7 +149,7 @@ PARTICLES = {
     "free, one for all": (vectors(free=lambda x: True), r"free= must return one bool for each"),
     "free, foreign tags": (
         vectors(free=(scenes.cell_tags(scenes.unit(1, TRIANGLE), lambda x: x[:, 0]), 1)),
-        r"must be those of cells of the body mesh",
+        r"must be those of cells of the present body mesh",
     ),
     "free, no such tag": (
         tagged((1, 7)),

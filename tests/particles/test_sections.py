@@ -13,7 +13,7 @@ import ufl
 from dolfinx import fem, mesh
 
 import mpm_dolfinx as mpm
-from mpm_dolfinx.materials import Hencky, Undrained
+from mpm_dolfinx.materials import Hencky, LinearElastic, Undrained
 
 TIGHT = mpm.Solver(petsc_options={"snes_rtol": 1e-12})
 
@@ -252,12 +252,55 @@ def test_what_makes_no_sense_is_refused():
         fails(lambda axis=axis: mpm.section_forces(particles, axis), "axis= must be two points")
     fails(lambda: mpm.section_forces(particles, line, 3), "where= is a function")
     tags = mpm.cell_tags(body, {1: mpm.region(x=(0.0, 0.5))})
-    fails(lambda: mpm.section_forces(particles, line, (tags, "wall")), "are whole numbers")
+    fails(lambda: mpm.section_forces(particles, line, (tags, "wall")), "is a whole number")
     fails(lambda: mpm.section_forces(particles, line, lambda x: x[0]), "one bool for each")
     nowhere = mpm.region(x=(3.0, 4.0))
     fails(lambda: mpm.section_forces(particles, line, nowhere), "is not between points 0 and 1")
     beyond = [(0.5, 0.5), (0.5, 1.0), (0.5, 2.0)]
     fails(lambda: mpm.section_forces(particles, beyond), "is not between points 1 and 2")
+    # An end would bear a part of what acts there.
+    for axis in ([(0.5, 0.5), (0.5, 1.1)], [(0.5, -0.1), (0.5, 0.4), (0.5, 0.5)]):
+        fails(lambda axis=axis: mpm.section_forces(particles, axis), "does not reach from point 0")
+    sides = mpm.facet_tags(body, {1: mpm.region(x=0.0)})
+    fails(lambda: mpm.section_forces(particles, line, (sides, 1)), "those of cells")
+
+
+def test_tags_of_a_mesh_that_was_split_are_refused_until_they_are_carried_over():
+    V = vectors(box([-0.5, -0.5], [1.5, 1.5], [8, 8], QUADRILATERAL))
+    body = box([0, 0], [1.0, 1.0], [8, 8], QUADRILATERAL)
+    tags = mpm.cell_tags(body, {1: mpm.region(x=(0.0, 0.5))})
+    particles = mpm.Particles(body, V, on_distortion="split")
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, Hencky(1e3, 0.3), density=1.0, body_force=(0.0, -10.0)),
+        bcs=[mpm.held(V, y=(-np.inf, 0.0))],
+    )
+    problem.solve()
+    line = [(0.25, 0.0), (0.25, 0.5), (0.25, 1.0)]
+    before = mpm.section_forces(particles, line, (tags, 1))
+    problem.split([4, 5])
+    fails(lambda: mpm.section_forces(particles, line, (tags, 1)), "those of cells of the present")
+    after = mpm.section_forces(particles, line, (particles.carry(tags), 1))
+    assert np.allclose(after.axial, before.axial, rtol=0.01) and before.axial.max() < -0.5
+
+
+def test_a_law_of_small_strains_is_in_equilibrium_where_the_body_was():
+    beam = box([0, 0], [3.0, 0.2], [20, 2], QUADRILATERAL)
+    tags = mpm.facet_tags(beam, {1: mpm.region(x=0.0), 2: mpm.region(x=3.0)})
+    particles = mpm.Particles(beam)
+    load = (200.0, -60.0)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(particles, LinearElastic(1e5, 0.2), tractions=[(load, 2)], facet_tags=tags),
+        supports=[mpm.boundary.fixed(particles, tags, 1)],
+        solver=TIGHT,
+    )
+    problem.solve()
+    found = mpm.section_forces(particles, np.linspace((0.0, 0.1), (3.0, 0.1), 8))
+    assert np.allclose(found.position[:, 0], 3.0 / 7.0 * (np.arange(7) + 0.5), atol=5e-3)
+    assert np.allclose(found.position[:, 1], 0.1, rtol=1e-12)
+    assert np.allclose(found.direction, (1.0, 0.0), atol=1e-12)
+    assert np.allclose(found.axial, 40.0, rtol=1e-9)
+    assert np.allclose(found.shear, 12.0, rtol=1e-9)
+    assert np.allclose(found.moment, -12.0 * (3.0 - found.position[:, 0]), rtol=1e-9)
 
 
 def test_a_body_of_revolution_is_refused():
