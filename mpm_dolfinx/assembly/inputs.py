@@ -48,7 +48,8 @@ def _expression(value: Any, particles: Particles, name: str, shape: tuple[int, .
         try:
             value = value(particles.mesh)
         except Exception as error:
-            raise as_ours(error, f"The function that makes {name}") from error
+            what = f"The function that makes {name}, and is given the body mesh,"
+            raise as_ours(error, what) from error
     if isinstance(value, list | tuple) and holds_ufl(value):
         # (with its Constants, whose values may change, and not what they are now)
         try:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError, agree
+from ..parallel.kinds import explaining
 from ..reals import as_reals
 from .given_pressure import AtPressure, at_pressure
 from .kinematics import KINEMATICS, LogarithmicStrain, SmallStrain
@@ -152,6 +153,12 @@ class Material(ABC):
     internal_variables: ClassVar[Mapping[str, tuple[int, ...]]] = MappingProxyType({})
     reversible: ClassVar[tuple[str, ...]] = ()
     _parameters: Parameters = Parameters({})
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Let its constructor explain what does not fit."""
+        super().__init_subclass__(**options)
+        if "__init__" in vars(cls):
+            explaining(cls)
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:

@@ -13,7 +13,7 @@ import inspect
 import re
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, wraps
 from types import NoneType, UnionType
 from typing import Any, Literal, TypeAliasType, Union, get_args, get_origin, get_type_hints
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from ..errors import MPMError
 
-__all__ = ["explained", "require_truths"]
+__all__ = ["explained", "explaining", "require_truths"]
 
 #: What Python and NumPy raise about an object that cannot do what is asked of it.
 CONFUSED = (
@@ -38,6 +38,9 @@ NUMBERS: dict[Any, tuple[type, ...]] = {
     int: (int, np.integer),
     float: (int, float, np.integer, np.floating),
 }
+#: What Python says of arguments that do not fit: by a name that is not known, and too many.
+STRANGE = re.compile(r"got an unexpected keyword argument '(\w+)'")
+TOO_MANY = re.compile(r"takes (?:from \d+ to )?(\d+) positional arguments? but (\d+)")
 #: Parameters that stand for several arguments.
 SEVERAL = inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL
 #: What truths are called in a message.
@@ -55,7 +58,7 @@ def explained(function: Callable[..., Any], args: Any, given: Any) -> Iterator[N
 
     Raises:
         MPMError: One of them is not what the annotation says, and the block fails for it.
-        TypeError: One has a name that the call does not know.
+        TypeError: One has a name that the call does not know, or there are too many without one.
     """
     try:
         yield
@@ -65,6 +68,19 @@ def explained(function: Callable[..., Any], args: Any, given: Any) -> Iterator[N
         if (told := _unknown(error, function, args, given)) is not None:
             raise TypeError(told) from None
         raise
+
+
+def explaining[T](kind: type[T]) -> type[T]:
+    """Return a class, whose constructor now explains what does not fit."""
+    made: Callable[..., None] = vars(kind)["__init__"]
+
+    @wraps(made)
+    def make(*args: Any, **given: Any) -> None:
+        with explained(made, args, given):
+            made(*args, **given)
+
+    setattr(kind, "__init__", make)
+    return kind
 
 
 def require_truths(function: Callable[..., Any], args: Any, given: Any) -> None:
@@ -110,12 +126,16 @@ def _misfit(
 
 
 def _unknown(error: Exception, function: Callable[..., Any], args: Any, given: Any) -> str | None:
-    """Return Python's sentence about an argument by a name that a call does not know.
+    """Return Python's sentence about arguments that a call does not take.
 
     It has the user's class, where Python's has the base that came to it at last, and what is known.
     """
-    found = re.search(r"got an unexpected keyword argument '(\w+)'", str(error))
-    if not isinstance(error, TypeError) or found is None or found[1] not in given:
+    strange, many = STRANGE.search(str(error)), TOO_MANY.search(str(error))
+    if not isinstance(error, TypeError) or (many is None and strange is None):
+        return None
+    if strange is not None and strange[1] not in given:
+        return None
+    if many is not None and int(many[2]) != len(args):
         return None
     called, takers = function.__qualname__, [function]
     if "." in called:
@@ -129,9 +149,12 @@ def _unknown(error: Exception, function: Callable[..., Any], args: Any, given: A
         names |= {p.name: None for p in parameters if p.kind not in SEVERAL and p.name != "self"}
         if all(p.kind is not inspect.Parameter.VAR_KEYWORD for p in parameters):
             break
-    near = difflib.get_close_matches(found[1], names, 1)
-    hint = f"did you mean {near[0]!r}?" if near else f"it has {', '.join(names)}."
-    return f"{called}() got an unexpected keyword argument {found[1]!r}; {hint}"
+    known = f"it has {', '.join(names)}."
+    if strange is None:
+        return f"{called}() got too many arguments without a name; {known}"
+    near = difflib.get_close_matches(strange[1], names, 1)
+    hint = f"did you mean {near[0]!r}?" if near else known
+    return f"{called}() got an unexpected keyword argument {strange[1]!r}; {hint}"
 
 
 @cache

@@ -19,6 +19,7 @@ from ..materials.fracture import Fracture
 from ..materials.undrained import Undrained
 from ..parallel.boundary import collective
 from ..parallel.given import is_number, require_same
+from ..parallel.kinds import explaining
 from ..particles.particles import Particles
 from ..reals import is_one_of
 from .arguments import as_pairs, carried, holds
@@ -35,6 +36,7 @@ def stays(what: str, consequence: str) -> MPMError:
     return MPMError(f"{what} lives on the present body mesh, so {consequence}.")
 
 
+@explaining
 @dataclass(frozen=True, eq=False)
 class PoreFluid:
     """The water in the pores of a body, for :class:`PorousProblem`.
@@ -82,6 +84,7 @@ class PoreFluid:
                 raise MPMError(f"{name} of a PoreFluid must be finite, not {value!r}.")
 
 
+@explaining
 @dataclass(frozen=True, eq=False)
 class Body:
     """A body: its particles, what they are made of, and what acts on them (collective).

@@ -477,7 +477,10 @@ class Problem(Hooks, OwnNames):
         place = next((number for number, one in enumerate(known) if one is bc), None)
         with agree(self._comm):
             if place is None:
-                raise MPMError(f"reaction() needs one of the {what} of this problem.")
+                raise MPMError(
+                    "reaction() takes a Dirichlet condition, a support or a term: one of the "
+                    f"{what} of this problem."
+                )
         require_same(self._comm, bc=f"number {place} of the {what}")
         if isinstance(bc, Support):
             own, known = self.built.supports, self.trial.converged.supports or ()

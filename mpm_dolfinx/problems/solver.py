@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import MPMError
 from ..parallel.given import require_truth
+from ..parallel.kinds import explaining
 from ..reals import is_one_of
 from ..solvers.strategies import LINEAR_SOLVERS
 from ..stabilisation.choice import STABILISATIONS
@@ -21,6 +22,7 @@ __all__ = ["Solver", "as_solver"]
 TOLERANCES = ("rtol", "atol", "stol", "max_it")
 
 
+@explaining
 @dataclass(frozen=True)
 class Solver:
     """How a problem is solved: ``QuasiStaticProblem(..., solver=mpm.Solver(linear="direct"))``.

@@ -243,7 +243,10 @@ def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) ->
     if unknown:
         raise _not_there(unknown)
     if count == 0:
-        raise MPMError("Nothing is to be removed, or it is removed already.")
+        raise MPMError(
+            "No particle is to be removed, or it is removed already: a function is asked at the "
+            "centroids of the undeformed domains."
+        )
     if rest == 0:
         raise MPMError("Nothing would be left of the body; a problem keeps a part of each body.")
     return np.flatnonzero(chosen & ~particles.deleted)

@@ -16,6 +16,7 @@ from dolfinx import mesh
 
 from ..errors import MPMError
 from ..parallel.given import is_number
+from ..parallel.kinds import explaining
 from ..reals import as_finite, holds_ufl
 
 __all__ = ["WaterTable"]
@@ -23,6 +24,7 @@ __all__ = ["WaterTable"]
 type Array = NDArray[np.float64]
 
 
+@explaining
 @dataclass(frozen=True)
 class WaterTable:
     """The pore pressure of water below a level: its weight times the depth below it.

@@ -523,6 +523,21 @@ def test_stiffnesses_and_permeabilities_that_differ():
         ),
         (lambda body: mpm.DynamicProblem(body, support=[]), "did you mean 'supports'"),
         (lambda body: mpm.QuasiStaticProblem(body).solve(step=3), "Problem.solve.*mean 'steps'"),
+        (
+            lambda body: mpm.materials.MohrCoulomb(1e4, 0.3, c=8.0),
+            r"^MohrCoulomb\(\).*has young, p",
+        ),
+        (lambda body: mpm.materials.Tresca(1e4, 0.3, cohesio=8.0), "^Tresca.*mean 'cohesion'"),
+        (
+            lambda body: mpm.Body(body.particles, body.material, gravity=9.81),
+            r"^Body\(\).*density, b",
+        ),
+        (lambda body: mpm.PoreFluid(k=1e-9), "^PoreFluid.*it has permeability, storage"),
+        (lambda body: mpm.WaterTable(level=3.0, gamma=9.81), "^WaterTable.*it has level, weight"),
+        (
+            lambda body: mpm.DynamicProblem(body).solve(10),
+            r"^DynamicProblem.solve\(\) got too many.*; it has time, dt",
+        ),
     ],
 )
 def test_an_argument_by_a_wrong_name_is_told_of_the_class_that_is_called(call, sentence):
