@@ -101,32 +101,31 @@ sys.exit(shutil.which(shlex.split(cc)[0]) is None)' ||
         fail "DOLFINx needs a C compiler at run time and there is none: install gcc."
 fi
 
-wanted=$state/requirements.txt
-
 pip_install() {
     # (Python compiles modules that are imported, when they are: a tenth of them.)
     "$py" -m pip install --quiet --disable-pip-version-check --no-compile "$@"
 }
 
+# Install what a file lists, if it lists something.
 install_wanted() {
-    if grep -q . "$wanted"; then
-        pip_install --requirement "$wanted"
+    if grep -q . "$1"; then
+        pip_install --requirement "$1"
     fi
 }
 
-# Install what pyproject.toml asks for: for the package and what builds it (package), and for extras.
+# Install what pyproject.toml asks for: to build the package (build), for it (package), for extras.
 install_for() {
-    "$py" - "$@" <<'END' >"$wanted"
+    "$py" - "$@" <<'END' >"$state/${1:-nothing}.txt"
 import sys
 import tomllib
 
 with open("pyproject.toml", "rb") as file:
     data = tomllib.load(file)
 known = data["project"]["optional-dependencies"]
-known["package"] = data["project"]["dependencies"] + data["build-system"]["requires"]
+known["package"], known["build"] = data["project"]["dependencies"], data["build-system"]["requires"]
 print("\n".join(line for name in sys.argv[1:] for line in known[name]))
 END
-    install_wanted
+    install_wanted "$state/${1:-nothing}.txt"
 }
 
 # shellcheck disable=SC2086  # a list of words
@@ -136,13 +135,17 @@ if [ "$built" = yes ]; then
 else
     echo "Installing this package with [${extras# }] into $venv (the first time this takes a minute or so)"
     rm -f "$installed"
-    install_for package $extras
+    install_for build
     # CMake and Ninja, where the machine has none
     "$py" -c '
 from scikit_build_core.build import get_requires_for_build_editable
-print("\n".join(get_requires_for_build_editable()))' >"$wanted"
-    install_wanted
-    pip_install --no-build-isolation --no-deps --editable .
+print("\n".join(get_requires_for_build_editable()))' >"$state/build.txt"
+    install_wanted "$state/build.txt"
+    # What it needs to run is fetched while it is compiled.
+    install_for package $extras &
+    pip_install --no-build-isolation --no-deps --editable . && status=0 || status=$?
+    wait $! || status=$?
+    [ "$status" = 0 ] || exit "$status"
 fi
 case "$extras " in
 *" adjoint "*) pip_install --no-deps dolfinx-adjoint fenicsx-compat ;;
