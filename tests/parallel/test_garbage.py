@@ -195,15 +195,25 @@ KINDS = {
 }
 
 
-@pytest.mark.filterwarnings("ignore:The domains have")
-@pytest.mark.parametrize("kind", KINDS)
-def test_problems_leave_no_communicator(kind):
-    def run(times):
-        for _ in range(times):
-            KINDS[kind]()
-            gc.collect()
+def run(kind, times):
+    for _ in range(times):
+        KINDS[kind]()
+        gc.collect()
 
-    run(1)
-    before = free_communicators()
-    run(3)
-    assert free_communicators() == before
+
+@pytest.mark.filterwarnings("ignore:The domains have")
+def test_problems_leave_no_communicator():
+    # (To count them takes longer than to run: one by one where there is something to find.)
+    for kind in KINDS:
+        run(kind, 1)
+    free = free_communicators()
+    for kind in KINDS:
+        run(kind, 3)
+    if (left := free_communicators()) == free:
+        return
+    leaks = {}
+    for kind in KINDS:
+        run(kind, 3)
+        free, left = left, free_communicators()
+        leaks[kind] = (free - left) / 3
+    pytest.fail(f"Communicators that a problem leaves: {leaks}")
