@@ -7,7 +7,6 @@ import scenes
 from posed import posed
 from scenes import HEXAHEDRON, PLANE, QUADRILATERAL, TETRAHEDRON, WORLD
 
-import ufl
 from dolfinx import fem, la
 
 import mpm_dolfinx as mpm
@@ -26,7 +25,7 @@ def column(comm=WORLD, policy="error", outside="error", **options):
         "facet_tags": scenes.facet_tags(body, scenes.at(1, 8.0), scenes.at(0, 4.0)),
         "pressures": [(5e3, 1)],
         "tractions": [((2e3, -1e3), 2)],
-        "density": lambda domain: 1000.0 + 50.0 * ufl.SpatialCoordinate(domain)[0],
+        "density": lambda x: 1000.0 + 50.0 * x[0],
         "body_force": (0.0, -12.0),
         "bcs": [scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
     }

@@ -8,15 +8,36 @@ from collections.abc import Sequence
 from typing import Any
 
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 from ufl.algorithms.analysis import extract_coefficients
 
 from ..constitutive.strain import Strain
 from ..errors import MPMError, agree
+from ..meshes.tags import require_on_boundary
+from ..meshes.values import Value, as_ufl
 from ..particles.particles import Particles
-from .inputs import as_expression, facet_measure
 
-__all__ = ["VirtualWork", "changeable"]
+__all__ = ["VirtualWork", "changeable", "facet_measure"]
+
+
+def facet_measure(
+    particles: Particles,
+    facet_tags: mesh.MeshTags | None,
+    loads: Sequence[tuple[Value, int]],
+    what: str,
+) -> ufl.Measure:
+    """Return the measure on a body's tagged facets, for pairs of a value and a tag.
+
+    Raises:
+        MPMError: Tags that are none.
+    """
+    require_on_boundary(particles.mesh, facet_tags, [tag for _, tag in loads], what)
+    return ufl.Measure(
+        "ds",
+        domain=particles.mesh,
+        subdomain_data=facet_tags,
+        metadata=particles.dx_exact.metadata(),
+    )
 
 
 class VirtualWork:
@@ -43,7 +64,7 @@ class VirtualWork:
 
     def body_force(self, density: Any, force: Any) -> ufl.Form:
         """Return the virtual work of the body force."""
-        b = as_expression(force, self._body, "body_force", (self._dim,))
+        b = as_ufl(force, self._body.mesh, "body_force", (self._dim,))
         work: ufl.Form = density * self._strain.turn * ufl.inner(b, self._v) * self._body.dx_exact
         return self._at_load([work])
 
@@ -53,7 +74,7 @@ class VirtualWork:
         Raises:
             MPMError: It is no pressure, or one that jumps between cells.
         """
-        p = as_expression(pressure, self._body, "pore_pressure", ())
+        p = as_ufl(pressure, self._body.mesh, "pore_pressure")
         with agree(self._body.mesh.comm):
             if any(f.ufl_element() not in ufl.H1 for f in extract_coefficients(p)):
                 raise MPMError(
@@ -70,7 +91,7 @@ class VirtualWork:
         terms = [
             self._strain.turn
             * self._body.undeformed.area_ratio
-            * ufl.inner(as_expression(t, self._body, "a traction", (self._dim,)), self._v)
+            * ufl.inner(as_ufl(t, self._body.mesh, "a traction", (self._dim,)), self._v)
             * ds(tag)
             for t, tag in loads
         ]
@@ -84,7 +105,7 @@ class VirtualWork:
         area = ufl.det(F) * ufl.inv(F).T * ufl.FacetNormal(self._body.mesh)
         area *= self._strain.present_turn
         terms = [
-            as_expression(p, self._body, "a pressure", ()) * ufl.inner(area, self._v) * ds(tag)
+            as_ufl(p, self._body.mesh, "a pressure") * ufl.inner(area, self._v) * ds(tag)
             for p, tag in loads
         ]
         return self._at_load(terms)

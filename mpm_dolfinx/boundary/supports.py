@@ -25,8 +25,9 @@ import ufl
 from dolfinx import fem
 from ufl.algorithms.analysis import extract_coefficients, extract_constants
 
-from ..assembly.inputs import as_expression, is_tag, known_tags
 from ..errors import MPMError, agree, warn
+from ..meshes.tags import require_on_boundary
+from ..meshes.values import Value, as_ufl
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_form
 from ..parallel.given import as_positive
@@ -75,11 +76,7 @@ class Support:
         if tag is None:
             self._ds = ufl.Measure("ds", domain=body, metadata=metadata)
         else:
-            known = known_tags(particles, facet_tags, "Supports")
-            if is_tag(tag) and tag in known:
-                known_tags(particles, facet_tags, "Supports", [tag])
-            else:
-                raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(known)}.")
+            require_on_boundary(body, facet_tags, [tag], "supports")
             self._ds = ufl.Measure(
                 "ds", domain=body, subdomain_data=facet_tags, subdomain_id=tag, metadata=metadata
             )
@@ -90,7 +87,7 @@ class Support:
         self._modulus = modulus is not None
         self._found: NDArray[np.float64] | None = None
         if modulus is not None:
-            self.scale(as_expression(modulus, particles, "modulus", ()))
+            self.scale(as_ufl(modulus, body, "modulus"))
         self._traction = -self._stiffness * gap
         self._turn: Any = 1.0
         self._whole_step = False
@@ -437,10 +434,10 @@ def roller(
     particles: Particles,
     facet_tags: Any,
     tag: int,
-    normal: Any,
-    value: Any = 0.0,
+    normal: Value,
+    value: Value = 0.0,
     *,
-    modulus: Any = None,
+    modulus: Value | None = None,
     penalty: float = PENALTY,
 ) -> Support:
     """Hold facets of a body in one direction: ``n . d = value``.
@@ -449,12 +446,12 @@ def roller(
         particles: The body.
         facet_tags: Tags of its facets.
         tag: The tag of those that are held.
-        normal: Direction in which they are held, numbers or UFL, shape ``(gdim,)``; numbers
-            are made a unit vector.
-        value: Displacement in that direction at full load, a number, Constant or UFL; a path
-            (``update=``) takes it as it is, as it does Dirichlet values.
-        modulus: Modulus of the body that the penalty is relative to, a number or UFL; in a
-            QuasiStaticProblem the material's by default.
+        normal: Direction in which they are held, shape ``(gdim,)``; numbers are made a unit
+            vector.
+        value: Displacement in that direction at full load; a path (``update=``) takes it as it
+            is, as it does Dirichlet values.
+        modulus: Modulus of the body that the penalty is relative to; in a QuasiStaticProblem the
+            material's by default.
         penalty: Stiffness of the support in units of modulus over thickness of a domain.
 
     Returns:
@@ -464,7 +461,7 @@ def roller(
         MPMError: Tags, directions or numbers that make no sense.
     """
     n = _unit(normal, particles)
-    g = as_expression(value, particles, "value", ())
+    g = as_ufl(value, particles.mesh, "value")
     gap = ufl.dot(n, particles.displacement) - _reached(particles) * g
     return Support(particles, gap * n, facet_tags, tag, modulus, penalty)
 
@@ -474,9 +471,9 @@ def fixed(
     particles: Particles,
     facet_tags: Any,
     tag: int,
-    value: Any = None,
+    value: Value | None = None,
     *,
-    modulus: Any = None,
+    modulus: Value | None = None,
     penalty: float = PENALTY,
 ) -> Support:
     """Hold facets of a body in all directions: ``d = value``.
@@ -485,8 +482,7 @@ def fixed(
         particles: The body.
         facet_tags: Tags of its facets.
         tag: The tag of those that are held.
-        value: Their displacement, as for :func:`roller`; numbers, Constant or UFL, shape
-            ``(gdim,)``; ``None`` is zero.
+        value: Their displacement, as for :func:`roller`, shape ``(gdim,)``; ``None`` is zero.
         modulus: As for :func:`roller`.
         penalty: As for :func:`roller`.
 
@@ -497,7 +493,8 @@ def fixed(
         MPMError: Tags or numbers that make no sense.
     """
     gdim = _require(particles).mesh.geometry.dim
-    g = as_expression(np.zeros(gdim) if value is None else value, particles, "value", (gdim,))
+    held = np.zeros(gdim) if value is None else value
+    g = as_ufl(held, particles.mesh, "value", (gdim,))
     gap = particles.displacement - _reached(particles) * g
     return Support(particles, gap, facet_tags, tag, modulus, penalty)
 
@@ -507,8 +504,8 @@ def dashpot(
     particles: Particles,
     facet_tags: Any,
     tag: int,
-    normal: Any,
-    tangential: Any,
+    normal: Value,
+    tangential: Value,
 ) -> Support:
     """Let waves leave a body through facets: a quiet boundary, in a DynamicProblem.
 
@@ -522,7 +519,7 @@ def dashpot(
         particles: The body.
         facet_tags: Tags of its facets.
         tag: The tag of those that are quiet.
-        normal: Resistance to normal velocities, a number, Constant, Function or UFL.
+        normal: Resistance to normal velocities.
         tangential: Resistance to tangential velocities.
 
     Returns:
@@ -534,9 +531,7 @@ def dashpot(
     _require(particles)
     resistances = []
     for name, value in (("normal", normal), ("tangential", tangential)):
-        if isinstance(value, float | int) and value < 0.0:
-            raise MPMError(f"{name} must not be negative, not {value!r}.")
-        resistances.append(as_expression(value, particles, name, ()))
+        resistances.append(as_ufl(value, particles.mesh, name, negative=False))
     return Dashpot(particles, facet_tags, tag, *resistances)
 
 
@@ -554,11 +549,11 @@ def _require(particles: Any) -> Particles:
 
 def _unit(normal: Any, particles: Particles) -> Any:
     """Return a direction as UFL; numbers are made a unit vector."""
-    gdim = _require(particles).mesh.geometry.dim
-    if not isinstance(normal, ufl.core.expr.Expr):
-        as_expression(normal, particles, "normal", (gdim,))
-        length = float(np.linalg.norm(np.asarray(normal, dtype=np.float64)))
-        if length == 0.0:
-            raise MPMError("normal must not be zero.")
-        normal = np.asarray(normal, dtype=np.float64) / length
-    return as_expression(normal, particles, "normal", (gdim,))
+    body = _require(particles).mesh
+    made = as_ufl(normal, body, "normal", (body.geometry.dim,))
+    if not isinstance(made, fem.Constant) or made is normal:
+        return made
+    length = float(np.linalg.norm(made.value))
+    if length == 0.0:
+        raise MPMError("normal must not be zero.")
+    return fem.Constant(body, made.value / length)

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from dolfinx import fem, mesh
 
-from .. import _compat
 from ..errors import MPMError, agree
 from ..materials.base import Material, Parameter, Refused, State, check_parameter
+from ..meshes.tags import require_tags
 from ..particles.particles import Particles
 from .governed import Governed
 from .pressure import MeanStress, is_split, without_bulk
@@ -348,10 +348,8 @@ def in_cells(
             f"{{cell tag: material}}, not {type(materials).__name__}."
         )
     body = particles.mesh
-    if cell_tags is None or cell_tags.dim != body.topology.dim:
-        raise MPMError("A dictionary of materials needs cell_tags=, tags of the body's cells.")
-    if not _compat.are_tags_of(cell_tags, body):
-        raise MPMError("cell_tags are those of another mesh than the body's.")
+    require_tags(body, cell_tags, "cells", "a material")
+    assert cell_tags is not None
     tags = np.full(count, -1, dtype=np.int64)
     own = cell_tags.indices < count
     tags[cell_tags.indices[own]] = cell_tags.values[own]

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MPMError
+from ..parallel.given import one_line
 from ..reals import as_finite
 from .rotation import Pose, Turn, cayley_variation, crossing
-from .shapes import one_line
 
 __all__ = ["RigidMotion", "State", "as_inertia", "held_of", "names_of"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError, MPMError, as_ours
-from ..parallel.given import as_positive, is_number
+from ..parallel.given import as_positive, is_number, one_line
 from ..reals import as_finite, as_reals
 from ..tolerances import DIFFERENCE, HALF_DIGITS
 
@@ -25,7 +25,6 @@ __all__ = [
     "cavity",
     "cylinder",
     "disc",
-    "one_line",
     "plane",
     "signed_distance",
     "sphere",
@@ -420,8 +419,3 @@ def as_rotation(value: Any, what: str, gdim: int) -> NDArray[np.float64]:
         numbers = "a finite number" if count == 1 else "3 finite numbers"
         raise MPMError(f"{what} must be {numbers}, not {one_line(value)}.")
     return found
-
-
-def one_line(value: Any) -> str:
-    """Return a value in words, on one line."""
-    return " ".join(repr(value).split())

@@ -18,10 +18,10 @@ import basix
 from dolfinx import fem, la, mesh
 
 from .. import _compat
-from ..assembly.inputs import is_tag, known_tags
 from ..assembly.petsc import create_vector, with_entries_at
 from ..errors import MPMError
 from ..meshes.remesh import Column
+from ..meshes.tags import require_on_boundary
 from ..parallel.given import require_truth
 from ..particles.particles import Particles
 from ..tolerances import LAST_PLACES, ROUND_OFF
@@ -67,16 +67,14 @@ class Facets:
         dim = body.topology.dim - 1
         outer = _marked(body, particles.boundary())
         if facets is not None:
+            a_what = f"{what[0].lower()}{what[1:]}"
             if not isinstance(facets, list | tuple) or len(facets) != 2:
                 raise MPMError(
-                    f"facets= of {what[0].lower()}{what[1:]} must be tags and one of them, "
+                    f"facets= of {a_what} must be tags and one of them, "
                     f"(tags, 1), not {facets!r:.80}."
                 )
             facet_tags, tag = facets
-            known = known_tags(particles, facet_tags, what)
-            if not is_tag(tag) or tag not in known:
-                raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(known)}.")
-            known_tags(particles, facet_tags, what, [tag])
+            require_on_boundary(body, facet_tags, [tag], a_what)
             # (on any rank that knows the facet)
             outer = np.intersect1d(outer, _marked(body, facet_tags.find(tag)))
         # Tags are carried along where particles move; what a cut lays bare is none of them.

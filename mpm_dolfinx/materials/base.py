@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import MPMError, agree
+from ..parallel.given import not_a_value
 from ..parallel.kinds import explaining
 from ..reals import as_reals
 from .given_pressure import AtPressure, at_pressure
@@ -37,6 +38,9 @@ __all__ = [
     "exceeds",
     "per_row",
 ]
+
+#: What a parameter of a material may be besides a number.
+PARAMETERS = "one number per point, a scalar Constant or a DG0 Function on the body mesh"
 
 type Parameter = float | NDArray[np.float64]
 """One value for all points, or an array ``(n,)`` with one per point."""
@@ -610,11 +614,11 @@ def check_parameter(
             raise TypeError("a truth is no number")
         values = as_reals(given)
     except (TypeError, ValueError):
-        raise MPMError(f"{name} must be a number or one number per point, not {value!r}") from None
+        raise not_a_value(name, value, (), PARAMETERS) from None
     if held and values.ndim > 0:
         raise MPMError(f"{name} must be a scalar Constant, not one of shape {values.shape}")
     if values.ndim > 1:
-        raise MPMError(f"{name} must be a number or one number per point, not {values.ndim}-D")
+        raise not_a_value(name, value, (), PARAMETERS)
     allowed = np.isfinite(values)
     words = ["finite"]
     if above is not None:

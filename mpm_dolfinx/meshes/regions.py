@@ -15,13 +15,21 @@ from numpy.typing import NDArray
 
 from dolfinx import fem, mesh
 
-from .. import _compat
 from ..errors import MPMError, agree, as_ours
 from ..parallel.boundary import collective
-from ..reals import as_reals, as_wholes
+from ..parallel.given import is_number, not_a_value
+from ..reals import as_reals, holds_ufl
 from ..tolerances import NEGLIGIBLE
+from .tags import require_tag
+from .values import Value, as_ufl, interpolated, is_function
 
-__all__ = ["cell_tags", "facet_tags", "held", "in_space", "marked", "region", "tagged"]
+__all__ = ["cell_tags", "facet_tags", "held", "in_space", "marked", "region"]
+
+#: What a Dirichlet value may be besides numbers.
+KINDS = (
+    "a Constant, a Function on V or the collapsed subspace of the component, or a function of "
+    "coordinates"
+)
 
 type Where = Callable[[NDArray[np.float64]], Any]
 
@@ -107,32 +115,6 @@ def marked(where: Where, points: NDArray[np.float64], what: str) -> NDArray[np.b
             f"not an array of shape {inside.shape} and type {inside.dtype}."
         )
     return inside.astype(np.bool_)
-
-
-def tagged(where: tuple[mesh.MeshTags, Any], domain: mesh.Mesh, name: str) -> NDArray[np.int32]:
-    """Return the local cells of a mesh that have a tag, or one of several.
-
-    Args:
-        where: Tags of the cells, and the tag or tags.
-        domain: The mesh.
-        name: Name of the argument.
-
-    Raises:
-        MPMError: Tags of something else, or a tag that is no whole number.
-    """
-    tags, wanted = where
-    if tags.dim != domain.topology.dim or not _compat.are_tags_of(tags, domain):
-        raise MPMError(
-            f"The tags in {name}=(tags, tag) must be those of cells of the present body mesh, "
-            "particles.mesh; particles.carry() takes older ones over to it."
-        )
-    try:
-        values = as_wholes(wanted).ravel()
-    except (TypeError, ValueError):
-        raise MPMError(
-            f"The tag in {name}=(tags, tag) is a whole number, or several, not {wanted!r}."
-        ) from None
-    return np.asarray(tags.indices[np.isin(tags.values, values)])
 
 
 def _bounds(name: str, value: Any) -> tuple[float, float] | None:
@@ -231,8 +213,7 @@ def _tags(
         if not isinstance(where, Mapping) or not where:
             raise MPMError(f"{noun}_tags needs {{tag: where, ...}}, not {where!r}.")
         for tag, inside in where.items():
-            if isinstance(tag, bool) or not isinstance(tag, int | np.integer):
-                raise MPMError(f"A tag is a whole number, not {tag!r}.")
+            require_tag(tag, f"{noun}_tags")
             if not callable(inside):
                 raise MPMError(
                     f"Where the {noun}s of tag {tag} are is a function of coordinates, such as "
@@ -256,7 +237,7 @@ def held(
     component: int | None = None,
     where: Where | None = None,
     *,
-    value: Any = 0.0,
+    value: Value = 0.0,
     **planes: Any,
 ) -> fem.DirichletBC:
     """Return a Dirichlet condition on the facets of the background in a region (collective).
@@ -268,8 +249,8 @@ def held(
         V: The background space.
         component: The component that is held; ``None``: all of them, or the one of a scalar space.
         where: Where the facets are: all of their vertices lie there.
-        value: A number, a vector where all components are held, a Constant, or a Function on V, or
-            on the collapsed subspace of the component.
+        value: A :data:`~mpm_dolfinx.meshes.values.Value`, with all components where all are held;
+            of UFL Constants and Functions alone, on V or the collapsed subspace of the component.
         **planes: ``x=``, ``y=``, ``z=``, ``polygon=``, as in :func:`region`, in place of ``where``.
 
     Raises:
@@ -310,29 +291,30 @@ def _condition(
     dim: int,
     value: Any,
 ) -> fem.DirichletBC:
-    """Return the condition with a value on the dofs of facets."""
-    if isinstance(value, fem.Function):
-        own = value.function_space
-        if component is None:
-            dofs = fem.locate_dofs_topological(V, dim, facets)
-            return fem.dirichletbc(value, dofs)
-        pairs: Any = fem.locate_dofs_topological((space, own), dim, facets)
-        return fem.dirichletbc(value, pairs, space)
-    dofs = fem.locate_dofs_topological(space, dim, facets)
+    """Return the condition with a value on the dofs of facets (collective)."""
+    domain, size = V.mesh, V.num_sub_spaces
+    shape = (size,) if component is None and size else ()
+    given = value
     if isinstance(value, fem.Constant):
-        return fem.dirichletbc(value, dofs, space)
-    size = V.num_sub_spaces if component is None else 0
-    try:
-        numbers = as_reals(value)
-        whole = np.broadcast_to(numbers, (size,)) if size else numbers.reshape(())
-    except (TypeError, ValueError):
-        raise MPMError(
-            f"value= must be a number{f' or {size} of them' if size else ''}, a Constant or a "
-            f"Function, not {value!r}."
-        ) from None
-    if not np.isfinite(whole).all():
-        raise MPMError(f"value= must be finite, not {value!r}.")
-    return fem.dirichletbc(np.array(whole), dofs, space)
+        given = as_ufl(value, domain, "value=", shape)
+    elif is_function(value):
+        own = V if component is None else space.collapse()[0]
+        given = interpolated(value, own, "value=")
+    elif not isinstance(value, fem.Function):
+        if holds_ufl(value):
+            raise not_a_value("value=", value, shape, KINDS)
+        numbers = [value] * size if shape and is_number(value) else value
+        given = as_ufl(numbers, domain, "value=", shape).value
+    if not isinstance(given, fem.Function):
+        return fem.dirichletbc(given, fem.locate_dofs_topological(space, dim, facets), space)
+    own = given.function_space
+    same = own.mesh is domain and own.ufl_element() == space.ufl_element()
+    if not same or (component is None and own is not V):
+        raise not_a_value("value=", given, shape, KINDS)
+    if component is None:
+        return fem.dirichletbc(given, fem.locate_dofs_topological(V, dim, facets))
+    pairs: Any = fem.locate_dofs_topological((space, own), dim, facets)
+    return fem.dirichletbc(given, pairs, space)
 
 
 def _of_planes(planes: Mapping[str, Any], domain: mesh.Mesh) -> str:

@@ -25,15 +25,20 @@ from ufl.corealg.traversal import traverse_unique_terminals
 from ..errors import MPMError, gathered, met
 
 __all__ = [
+    "ON_A_MESH",
     "as_positive",
     "is_number",
     "is_ours",
+    "not_a_value",
+    "one_line",
     "options_of",
     "require_same",
     "require_truth",
     "require_whole",
 ]
 
+#: What a value may be besides numbers, where a mesh is known.
+ON_A_MESH = "a Constant, a Function or other UFL on the body mesh, or a function of coordinates"
 #: What describes a law besides its parameters.
 KINDS = ("symmetric", "kinematics", "inelastic")
 
@@ -115,6 +120,26 @@ def as_positive(value: Any, name: str) -> float:
     if not is_number(value) or not 0.0 < value < np.inf:
         raise MPMError(f"{name} must be a positive number, not {value!r}.")
     return float(value)
+
+
+def one_line(value: Any) -> str:
+    """Return a value in words, on one line."""
+    return " ".join(repr(value).split())
+
+
+def not_a_value(
+    name: str, value: Any, shape: tuple[int, ...] = (), kinds: str = ON_A_MESH
+) -> MPMError:
+    """Return the error that something is none of the kinds of values that are taken.
+
+    Args:
+        name: What it is called.
+        value: What was given.
+        shape: The shape that it must have.
+        kinds: What it may be besides numbers.
+    """
+    numbers = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+    return MPMError(f"{name} must be {numbers}, {kinds}, not {one_line(value):.80}.")
 
 
 def options_of(law: Any) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from mpi4py import MPI
 from petsc4py import PETSc
 
 import numpy as np
@@ -17,7 +16,8 @@ from dolfinx import fem, la, mesh
 
 from ..background.basis import PointBasis
 from ..errors import MPMError, agree
-from ..meshes.regions import marked, tagged
+from ..meshes.regions import marked
+from ..meshes.tags import cells_with, is_pair_with_tags
 from ..parallel.given import require_same
 from ..reals import as_wholes
 from ..transfer.matrix import transfer_matrix
@@ -168,10 +168,12 @@ def chosen_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.bool_]:
     require_same(W.mesh.comm, free="nodes" if _is_listed(where) else type(where).__name__)
     layout = W.dofmap.index_map
     marks = la.vector(layout, 1, dtype=np.float64)
-    with agree(W.mesh.comm):
-        marks.array[_local_nodes(W, where)] = 1.0
-    if isinstance(where, tuple) and not _is_listed(where):
-        _require_tags(W.mesh.comm, *where)
+    if is_pair_with_tags(where):
+        cells = cells_with(W.mesh, where[0], where[1], "free=")
+        marks.array[W.dofmap.list[cells].ravel()] = 1.0
+    else:
+        with agree(W.mesh.comm):
+            marks.array[_local_nodes(W, where)] = 1.0
     marks.scatter_reverse(la.InsertMode.add)
     own = marks.array[: layout.size_local]
     own[:] = own > 0.0
@@ -190,15 +192,6 @@ def _is_listed(where: Any) -> bool:
         return False
 
 
-def _require_tags(comm: MPI.Comm, tags: mesh.MeshTags, wanted: Any) -> None:
-    """Raise an error where no cell has a tag that is asked for (collective)."""
-    known: set[int] = set().union(*comm.allgather(set(tags.values.tolist())))
-    if missing := set(as_wholes(wanted).ravel().tolist()) - known:
-        raise MPMError(
-            f"No cell has the tag {min(missing)} of free=(tags, tag); there are {sorted(known)}."
-        )
-
-
 def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
     """Return local nodes of W."""
     layout = W.dofmap.index_map
@@ -214,9 +207,7 @@ def _local_nodes(W: fem.FunctionSpace, where: Any) -> NDArray[np.integer[Any]]:
         if len(nodes) and (nodes.min() < 0 or nodes.max() >= count):
             raise MPMError(f"free= has nodes that are none of the {count} local ones of W.")
         return nodes
-    if not (isinstance(where, tuple) and len(where) == 2 and isinstance(where[0], mesh.MeshTags)):
-        raise MPMError(
-            "free= is 'auto', a function of coordinates such as mpm.region(...), (cell tags, tag), "
-            f"or a list of local nodes of W, not {where!r}."
-        )
-    return np.unique(W.dofmap.list[tagged(where, W.mesh, "free")])
+    raise MPMError(
+        "free= is 'auto', a function of coordinates such as mpm.region(...), (cell tags, tag), or "
+        f"a list of local nodes of W, not {where!r}."
+    )

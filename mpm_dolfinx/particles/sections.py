@@ -17,7 +17,8 @@ from dolfinx import mesh
 
 from ..errors import MPMError, agree
 from ..meshes.quadrature import nodal_forces, vector_product
-from ..meshes.regions import in_space, marked, tagged
+from ..meshes.regions import in_space, marked
+from ..meshes.tags import cells_with, is_pair_with_tags
 from ..parallel.boundary import collective
 from ..parallel.totals import over_ranks
 from ..reals import as_reals
@@ -89,6 +90,7 @@ def section_forces(
             parts of it where the structure is not, or tags of another mesh than the present one.
     """
     comm, gdim = particles.mesh.comm, particles.mesh.geometry.dim
+    chosen = _chosen(particles, where)
     with agree(comm):
         if particles.revolves:
             raise MPMError(
@@ -96,7 +98,7 @@ def section_forces(
                 "revolution bears around the axis too, which particles.stress tells."
             )
         points = _points(axis, gdim)
-        cells = np.flatnonzero(_chosen(particles, where) & ~particles.deleted)
+        cells = np.flatnonzero(chosen & ~particles.deleted)
         sections = _Sections(particles, points, cells)
     area, moments, directions = (over_ranks(comm, part) for part in sections.measures())
     missed = sections.missed(comm)
@@ -197,19 +199,21 @@ def _points(axis: Any, gdim: int) -> Array:
 
 
 def _chosen(particles: Particles, where: Any) -> NDArray[np.bool_]:
-    """Return which of this rank's domains are the structure."""
-    if where is None:
-        return np.ones(particles.num_local, dtype=bool)
-    if callable(where):
-        return marked(where, in_space(particles.initial_centroid), "The function where=")
-    if not (isinstance(where, tuple) and len(where) == 2 and isinstance(where[0], mesh.MeshTags)):
-        raise MPMError(
-            "where= is a function of coordinates such as mpm.region(...), or (cell tags, tag), not "
-            f"{where!r}."
-        )
-    chosen = np.zeros(particles.num_local, dtype=bool)
-    cells = tagged(where, particles.mesh, "where")
-    chosen[cells[cells < particles.num_local]] = True
+    """Return which of this rank's domains are the structure (collective)."""
+    chosen = np.ones(particles.num_local, dtype=bool)
+    if is_pair_with_tags(where):
+        cells = cells_with(particles.mesh, where[0], where[1], "where=")
+        chosen[:] = False
+        chosen[cells[cells < particles.num_local]] = True
+        return chosen
+    with agree(particles.mesh.comm):
+        if callable(where):
+            chosen = marked(where, in_space(particles.initial_centroid), "The function where=")
+        elif where is not None:
+            raise MPMError(
+                "where= is a function of coordinates such as mpm.region(...), or (cell tags, tag), "
+                f"not {where!r}."
+            )
     return chosen
 
 

@@ -18,10 +18,10 @@ from ufl.domain import extract_unique_domain
 from ufl.measure import integral_type_to_measure_name
 
 from .. import _compat
-from ..assembly.inputs import is_tag
 from ..boundary.supports import Support
 from ..errors import MPMError
 from ..materials.base import Material
+from ..meshes.tags import is_tag
 from ..particles.field import CarriedField, ParticleField
 from ..particles.particles import LoadFactor, Particles
 from ..system.term import Term
@@ -382,6 +382,15 @@ def require_no_conditions_on_bodies(
     free = [body.W for body in bodies if body.free_nodes is not None]
     if any(_compat.is_condition_on(bc, W) for bc in bcs for W in free):
         raise MPMError(f"Dirichlet conditions on W lie on the present body mesh, so {consequence}.")
+
+
+def functions_of(assignment: Any) -> list[fem.Function]:
+    """Return the Functions among the parameters of materials."""
+    if isinstance(assignment, Mapping):
+        return [function for material in assignment.values() for function in functions_of(material)]
+    if not isinstance(assignment, Material):
+        return []
+    return [v for v in assignment.parameters.values() if isinstance(v, fem.Function)]
 
 
 def carried(particles: Particles, assignment: Any) -> Any:

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -17,6 +17,7 @@ from ..constitutive.averaging import F_BARS
 from ..errors import MPMError
 from ..materials.fracture import Fracture
 from ..materials.undrained import Undrained
+from ..meshes.values import Value
 from ..parallel.boundary import collective
 from ..parallel.given import is_number, require_same
 from ..parallel.kinds import explaining
@@ -43,29 +44,28 @@ class PoreFluid:
 
     Args:
         permeability: Hydraulic conductivity over the specific weight of water (length^2 over
-            pressure and time): a positive number, or what must not be negative anywhere when a step
-            begins: a Constant or Function, UFL on the body mesh, or a function of the volume ratio
-            J that returns UFL, ``lambda J: k * J**3``.
+            pressure and time), not negative anywhere when a step begins: a
+            :data:`~mpm_dolfinx.meshes.values.Value`, whose function is one of the volume ratio J
+            that returns UFL, ``lambda J: k * J**3``.
         storage: Change of the water's volume by its pressure, per undeformed volume (one over a
             pressure): the porosity times the compressibility of water.
         density: Mass per volume of the water, on which the ``body_force`` of the body acts as well;
             0 where the pore pressure is the excess over the hydrostatic one.
-        drained: Pairs of a pore pressure (number or UFL) and a tag of the body's ``facet_tags``,
+        drained: Pairs of a pore pressure and a tag of the body's ``facet_tags``,
             where water comes and goes at this pressure; the rest of the boundary is impervious.
         inflow: Pairs of a volume of water that flows in per undeformed area and time, and a tag.
-        pressure: Pore pressure at the beginning: a number, or a function of coordinates ``(3, n)``
-            that returns ``(n,)``.
+        pressure: Pore pressure at the beginning.
 
     Raises:
         MPMError: Numbers or lists that make no sense.
     """
 
-    permeability: Any
-    storage: Any = 0.0
+    permeability: Value
+    storage: Value = 0.0
     density: float = 0.0
-    drained: Sequence[Any] = ()
-    inflow: Sequence[Any] = ()
-    pressure: Any = 0.0
+    drained: Sequence[tuple[Value, int]] = ()
+    inflow: Sequence[tuple[Value, int]] = ()
+    pressure: Value = 0.0
 
     def __post_init__(self) -> None:
         """Say so where something makes no sense."""
@@ -89,19 +89,21 @@ class PoreFluid:
 class Body:
     """A body: its particles, what they are made of, and what acts on them (collective).
 
+    Density, loads, pore pressure, and what it begins with are each a
+    :data:`~mpm_dolfinx.meshes.values.Value`: numbers, UFL on the body mesh, or a function of
+    coordinates.
+
     Args:
         particles: The particles.
         material: A material, or ``{cell tag: material}`` with ``cell_tags``.
-        density: Mass per undeformed volume: a number, Constant, Function or UFL expression; in a
-            :class:`PorousProblem` that of soil and water together. ``None`` is one where the body
-            is at rest, and missing where it moves.
-        body_force: Force per mass at full load: a tuple, Constant, Function or UFL expression
-            on the body mesh, or a function that makes one from the mesh.
-        tractions: Pairs of a dead load per undeformed area at full load (tuple or UFL) and a
+        density: Mass per undeformed volume; in a :class:`PorousProblem` that of soil and water
+            together. ``None`` is one where the body is at rest, and missing where it moves.
+        body_force: Force per mass at full load, shape ``(gdim,)``.
+        tractions: Pairs of a dead load per undeformed area at full load, shape ``(gdim,)``, and a
             tag of ``facet_tags``.
-        pressures: Pairs of a pressure at full load (number or UFL) and a tag of
-            ``facet_tags``; it acts on the deformed facets, against their normal, per deformed
-            area (a follower load, whose tangent is not symmetric).
+        pressures: Pairs of a pressure at full load and a tag of ``facet_tags``; it acts on the
+            deformed facets, against their normal, per deformed area (a follower load, whose
+            tangent is not symmetric).
         cell_tags: Tags of the cells of ``particles.mesh``.
         facet_tags: Tags of its facets.
         f_bar: Average of the volume ratio that the material sees, against hourglass modes and
@@ -111,19 +113,17 @@ class Body:
             a band of it is as wide on any mesh: about five lengths, for which the domains must be
             smaller than half of it. ``None``: each point softens by its own.
         initial_stress: Cauchy stress that the body carries before it has moved, which its material
-            must be able to bear: ``(3, 3)`` with the direction out of the plane (or around the
-            axis) at last, one for each owned particle or point ``(n, 3, 3)`` or
-            ``(n, nq, 3, 3)``, UFL of the shape ``(3, 3)`` on the body mesh, a function of
-            coordinates ``(3, n)`` that returns ``(3, 3, n)``, or :func:`mpm_dolfinx.geostatic`.
+            must be able to bear, shape ``(3, 3)`` with the direction out of the plane (or around
+            the axis) at last, such as :func:`mpm_dolfinx.geostatic`; also one for each owned
+            particle or point, ``(n, 3, 3)`` or ``(n, nq, 3, 3)``.
             What it is not in equilibrium with goes in proportion, as loads come, in the first run.
-        velocity: At the beginning, in a :class:`DynamicProblem`: a tuple, a function of coordinates
-            ``(3, n)`` that returns ``(gdim, n)``, a Function, or a UFL expression on the body mesh.
+        velocity: At the beginning, in a :class:`DynamicProblem`, shape ``(gdim,)``.
         pore_fluid: The water in its pores, in a :class:`PorousProblem`.
-        pore_pressure: A pore pressure that is known, at full load: a :class:`WaterTable`, UFL on
-            the body mesh such as a Function of steady seepage, or a function that makes it from
-            the mesh. The material is then the law of the effective stress, the density that of soil
-            and water together, and the pressure acts by its gradient in the undeformed body: as
-            buoyancy and seepage. On its boundary it is held, or open water has the same pressure.
+        pore_pressure: A pore pressure that is known, at full load, such as a :class:`WaterTable` or
+            a Function of steady seepage. The material is then the law of the effective stress, the
+            density that of soil and water together, and the pressure acts by its gradient in the
+            undeformed body: as buoyancy and seepage. On its boundary it is held, or open water has
+            the same pressure.
 
     Raises:
         MPMError: Something that is none of these, or differs between ranks.
@@ -131,18 +131,18 @@ class Body:
 
     particles: Particles
     material: Any
-    density: Any = None
-    body_force: Any = None
-    tractions: Sequence[Any] = ()
-    pressures: Sequence[Any] = ()
+    density: Value | None = None
+    body_force: Value | None = None
+    tractions: Sequence[tuple[Value, int]] = ()
+    pressures: Sequence[tuple[Value, int]] = ()
     cell_tags: Any = None
     facet_tags: Any = None
     f_bar: str = "none"
     length: float | None = None
-    initial_stress: Any = None
-    velocity: Any = None
+    initial_stress: Value | None = None
+    velocity: Value | None = None
     pore_fluid: PoreFluid | None = None
-    pore_pressure: Any = None
+    pore_pressure: Value | None = None
 
     @collective()
     def __post_init__(self) -> None:
@@ -245,17 +245,11 @@ class Body:
         Raises:
             MPMError: Something lives on its present mesh.
         """
-        for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
-            if holds(getattr(self, name), ufl.core.expr.Expr):
-                raise MPMError(
-                    f"{name} is written on the present body mesh, so {consequence}; give a "
-                    "function that makes it from a mesh, e.g. "
-                    "lambda mesh: ufl.SpatialCoordinate(mesh)[1]."
-                )
-        for name, value in ({} if self.pore_fluid is None else vars(self.pore_fluid)).items():
+        for name, value in self._acting():
             if holds(value, ufl.core.expr.Expr):
                 raise MPMError(
-                    f"{name} is written on the present body mesh, so {consequence}; give numbers."
+                    f"{name} is written on the present body mesh, so {consequence}; give numbers, "
+                    "or a function of coordinates such as lambda x: 2.0 * x[1]."
                 )
         laws = self.material.values() if isinstance(self.material, Mapping) else [self.material]
         for law in laws:
@@ -270,11 +264,18 @@ class Body:
         self.require_movable(consequence)
         if self.length is not None:
             raise stays("length=", consequence)
-        for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
-            if holds(getattr(self, name), Callable):
+        for name, value in self._acting():
+            if name != "permeability" and holds(value, Callable):
                 raise MPMError(
-                    f"{name} is a function of the mesh, whose nodes move, so {consequence}."
+                    f"{name} is a function of coordinates, which change, so {consequence}."
                 )
+
+    def _acting(self) -> Iterator[tuple[str, Any]]:
+        """Yield the values that act on it in a run, by name."""
+        for name in ("density", "body_force", "tractions", "pressures", "pore_pressure"):
+            yield name, getattr(self, name)
+        fluid = {} if self.pore_fluid is None else vars(self.pore_fluid)
+        yield from ((name, value) for name, value in fluid.items() if name != "pressure")
 
 
 def as_given(bodies: Body | Sequence[Body]) -> list[Body]:

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-from ..assembly.inputs import Density
+from ..assembly.density import Density
 from ..boundary.supports import Support
 from ..constitutive.beginning import take_over
 from ..constitutive.points import MaterialPoints
 from ..constitutive.step_stress import StepStress
 from ..errors import MPMError, not_with, warn
+from ..meshes.values import Value
 from ..parallel.boundary import collective
 from ..parallel.given import is_number, require_same
 from ..particles.particles import Particles
@@ -281,8 +282,7 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
     Args:
         R: As in :class:`ParticleProblem`: internal less external forces.
         particles: As there.
-        density: Mass per volume of the body mesh, positive: a number, Constant, Function or UFL; a
-            list has one for each body.
+        density: Mass per volume of the body mesh, positive; a list has one for each body.
         velocity: At the beginning: as that of a :class:`Body`; a list has one for each body.
         scheme: ``"midpoint"``, ``"euler"`` or a :class:`Scheme`. Stress of a whole step
             (``"conserving"``) is for materials: write the law as one.
@@ -302,9 +302,9 @@ class DynamicParticleProblem(MovingProblem, ParticleProblem):
         self,
         R: ufl.Form | Sequence[ufl.Form],
         particles: Particles | Sequence[Particles],
-        density: Any,
+        density: Value | list[Value],
         *,
-        velocity: Any = None,
+        velocity: Value | list[Value] | None = None,
         scheme: str | Scheme = "midpoint",
         out_of_range: str = "project",
         damping: float = 0.0,

@@ -13,16 +13,13 @@ from mpi4py import MPI
 import numpy as np
 from numpy.typing import NDArray
 
-import ufl
-from dolfinx import fem
-
-from ..assembly.inputs import as_expression
-from ..errors import MPMError, agree, as_ours, warn
+from ..errors import MPMError, agree, warn
 from ..meshes.quadrature import quadrature_rule
 from ..meshes.regions import in_space
-from ..parallel.compilation import compiled_expression
+from ..meshes.values import AtPoints, Value, as_ufl, at_points, is_function
+from ..parallel.given import ON_A_MESH, not_a_value
 from ..particles.particles import Particles
-from ..reals import as_reals
+from ..reals import as_reals, holds_ufl
 from .body import Body
 from .water_table import WaterTable
 
@@ -192,9 +189,9 @@ def _other_weight(stress: _Geostatic, body: Body) -> str:
     weight = np.zeros_like(told)
     if body.body_force is not None:
         density = 1.0 if body.density is None else body.density
-        force = as_expression(body.body_force, particles, "body_force", (gdim,))
-        mass = as_expression(density, particles, "density", ())
-        product = _evaluated(force, particles) * _evaluated(mass, particles)[..., None]
+        force = _of_loads(body.body_force, particles, "body_force", (gdim,))
+        mass = _of_loads(density, particles, "density", ())
+        product = force * mass[..., None]
         weight = product.reshape(-1, gdim).T
     return _where_other(
         particles, "density times body_force", weight, told, np.linalg.norm(told, axis=0)
@@ -212,8 +209,7 @@ def _other_water(stress: _Geostatic, body: Body) -> str:
     told = np.zeros(x.shape[1]) if water is None else water.on(-(stress.down @ x), x)
     pressure = np.zeros_like(told)
     if known is not None:
-        p = as_expression(known, particles, "pore_pressure", ())
-        pressure = _evaluated(p, particles).ravel()
+        pressure = _of_loads(known, particles, "pore_pressure", ()).ravel()
     size = np.maximum(stress.vertical(x), 0.0) + told
     return _where_other(particles, "pore_pressure", pressure[None], told[None], size)
 
@@ -274,19 +270,19 @@ def _coordinates(particles: Particles) -> Array:
     return in_space(points.reshape(-1, points.shape[-1]))
 
 
-def _evaluated(value: Any, particles: Particles) -> Array:
-    """Return UFL on the body mesh at the history's points, shape ``(n, nq, ...)`` (collective)."""
-    n, nq = particles.num_local, particles.num_points
-    if isinstance(value, fem.Constant):
-        return np.broadcast_to(value.value, (n, nq, *value.ufl_shape))
-    value = fem.Constant(particles.mesh, 1.0) * value  # UFL that is a number knows no ranks
-    points, _ = quadrature_rule(particles.mesh.basix_cell(), particles.geometry.quadrature_degree)
-    at_points = compiled_expression(value, points, particles.mesh.comm)
-    evaluated: Any = at_points.eval(particles.mesh, np.arange(n, dtype=np.int32))
-    return np.asarray(evaluated.reshape(n, nq, *value.ufl_shape))
+def _of_loads(value: Any, particles: Particles, name: str, shape: tuple[int, ...]) -> Array:
+    """Return a value that acts in a run at the history's points, ``(n, nq, ...)`` (collective)."""
+    made = as_ufl(value, particles.mesh, name, shape)
+    return AtPoints(made, particles.mesh, _rule(particles)).values()
 
 
-def initial_stress_at_points(value: Any, particles: Particles) -> Array:
+def _rule(particles: Particles) -> Array:
+    """Return the history's points in the reference cell."""
+    degree = particles.geometry.quadrature_degree
+    return quadrature_rule(particles.mesh.basix_cell(), degree)[0]
+
+
+def initial_stress_at_points(value: Value, particles: Particles) -> Array:
     """Return an initial stress at the history's points (collective).
 
     Args:
@@ -299,47 +295,30 @@ def initial_stress_at_points(value: Any, particles: Particles) -> Array:
     Raises:
         MPMError: It is something else, of another shape, or not finite.
     """
-    if isinstance(value, ufl.core.expr.Expr):
-        made = as_expression(value, particles, "initial_stress", (3, 3))
-        values: Array = _evaluated(made, particles)
+    name, body = "initial_stress", particles.mesh
+    if isinstance(value, _Geostatic):
+        with agree(body.comm):
+            value.require_for(body.geometry.dim)
+    if is_function(value) or holds_ufl(value):
+        rule, x = _rule(particles), _coordinates(particles)
+        values = at_points(value, body, name, (3, 3), rule, x)
     else:
-        with agree(particles.mesh.comm):
-            values = _at_points(value, particles)
-    with agree(particles.mesh.comm):
+        with agree(body.comm):
+            values = _of_numbers(value, name, particles)
+    with agree(body.comm):
         bad = ~np.isfinite(values).all(axis=(1, 2, 3))
         if bad.any():
-            raise MPMError(
-                "initial_stress is not finite at {particles}.", particles.global_index[bad]
-            )
+            raise MPMError(f"{name} is not finite at {{particles}}.", particles.global_index[bad])
     return np.array(values, dtype=np.float64)
 
 
-def _at_points(value: Any, particles: Particles) -> Array:
+def _of_numbers(value: Any, name: str, particles: Particles) -> Array:
     n, nq = particles.num_local, particles.num_points
-    if isinstance(value, _Geostatic):
-        value.require_for(particles.mesh.geometry.dim)
-    if callable(value):
-        try:
-            found = as_reals(value(_coordinates(particles)))
-        except MPMError:
-            raise
-        except Exception as error:
-            raise as_ours(error, "The function that gives initial_stress") from error
-        if found.shape != (3, 3, n * nq):
-            raise MPMError(
-                "The function that gives initial_stress must return, for coordinates (3, n), "
-                f"stresses of the shape (3, 3, n), not {found.shape} for n = {n * nq}."
-            )
-        return np.moveaxis(found, -1, 0).reshape(n, nq, 3, 3)
     try:
         array = as_reals(value)
     except (TypeError, ValueError):
         array = np.zeros(0)
     if array.shape not in ((3, 3), (n, 3, 3), (n, nq, 3, 3)):
-        raise MPMError(
-            "initial_stress must be a stress (3, 3), an array of them for each owned particle or "
-            "point, (n, 3, 3) or (n, nq, 3, 3), UFL of the shape (3, 3), a function of "
-            f"coordinates, or mpm.geostatic(...), not {type(value).__name__} of the shape "
-            f"{array.shape}."
-        )
+        each = "one for each owned particle or point, (n, 3, 3) or (n, nq, 3, 3)"
+        raise not_a_value(name, value, (3, 3), f"{each}, {ON_A_MESH} such as mpm.geostatic(...)")
     return np.broadcast_to(array if array.ndim != 3 else array[:, None], (n, nq, 3, 3))

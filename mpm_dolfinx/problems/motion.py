@@ -16,17 +16,14 @@ from petsc4py import PETSc
 import numpy as np
 from numpy.typing import NDArray
 
-import ufl
 from dolfinx import fem
 
-from .. import _compat
-from ..assembly.inputs import as_expression
 from ..boundary.supports import Support
-from ..errors import MPMError, agree, as_ours, warn
+from ..errors import MPMError, warn
 from ..history import Energy
-from ..parallel.compilation import compiled_expression
+from ..meshes.values import Value, interpolated
 from ..particles.particles import Particles
-from ..reals import as_finite, as_reals
+from ..reals import as_finite
 from ..stepping.automatic import local_error
 from ..system.inertia import Inertia
 from ..system.schemes import order_of
@@ -289,49 +286,12 @@ def rayleigh_of(values: Any) -> tuple[float, float]:
     return alpha, beta
 
 
-def initial_velocity(value: Any, body: Particles) -> fem.Function:
-    """Return an initial velocity on W (collective).
+def initial_velocity(value: Value | None, body: Particles) -> fem.Function:
+    """Return an initial velocity on W, none where none is given (collective).
 
     Raises:
         MPMError: It is something else, or not finite.
     """
-    velocity = fem.Function(body.W, name="velocity")
     if value is None:
-        return velocity
-    if isinstance(value, fem.Function) and value.function_space.mesh is not body.mesh:
-        raise MPMError("velocity lives on another mesh; give a Function on particles.mesh.")
-    if isinstance(value, fem.Function) or (
-        callable(value) and not isinstance(value, ufl.core.expr.Expr)
-    ):
-        with agree(body.mesh.comm):
-            _interpolate(velocity, value)
-    else:
-        expression = as_expression(value, body, "velocity", (body.mesh.geometry.dim,))
-        points = _compat.interpolation_points(body.W)
-        velocity.interpolate(compiled_expression(expression, points, body.mesh.comm))
-    velocity.x.scatter_forward()
-    finite = bool(np.isfinite(velocity.x.array).all())
-    if body.mesh.comm.allreduce(not finite):
-        raise MPMError("velocity must be finite everywhere on the body.")
-    return velocity
-
-
-def _interpolate(velocity: fem.Function, value: Any) -> None:
-    """Interpolate a Function, or a function of coordinates."""
-
-    def shaped(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        values = as_reals(value(x))
-        wanted = velocity.function_space.dofmap.index_map_bs, x.shape[1]
-        if values.shape != wanted:
-            raise MPMError(
-                f"The function that gives velocity must return values of the shape {wanted} for "
-                f"coordinates {x.shape}, not {values.shape}."
-            )
-        return values
-
-    try:
-        velocity.interpolate(value if isinstance(value, fem.Function) else shaped)
-    except MPMError:
-        raise
-    except Exception as error:
-        raise as_ours(error, "The function that gives velocity") from error
+        return fem.Function(body.W, name="velocity")
+    return interpolated(value, body.W, "velocity")

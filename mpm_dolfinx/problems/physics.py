@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import ufl
 from dolfinx import fem
 
-from ..assembly.inputs import Density
+from ..assembly.density import Density
 from ..assembly.loads import VirtualWork, changeable
 from ..assembly.rules import depends_on
 from ..boundary.supports import Support

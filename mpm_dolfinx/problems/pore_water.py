@@ -4,18 +4,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
-from dolfinx import fem
-
-from ..assembly.inputs import as_expression
 from ..constitutive.points import MaterialPoints
 from ..materials.undrained import EXCESS
 from ..meshes.quadrature import quadrature_rule
-from ..parallel.compilation import compiled_expression
+from ..meshes.values import AtPoints, Value, as_ufl
 from ..particles.particles import Particles
 
 __all__ = ["Excess", "PoreWater", "water_in"]
@@ -60,31 +55,29 @@ class PoreWater:
 
     name = "pore_pressure"
 
-    def __init__(self, particles: Particles, known: Any, excess: Excess | None) -> None:
+    def __init__(self, particles: Particles, known: Value | None, excess: Excess | None) -> None:
         self._particles, self._excess = particles, excess
-        self._known: fem.Expression | None = None
+        self._known: AtPoints | None = None
         if known is not None:
-            p = as_expression(known, particles, self.name, ())
-            p = fem.Constant(particles.mesh, 1.0) * p  # (a constant one knows no ranks)
-            rule, _ = quadrature_rule(
-                particles.mesh.basix_cell(), particles.geometry.quadrature_degree
-            )
-            self._known = compiled_expression(p, rule, particles.mesh.comm)
+            body = particles.mesh
+            rule, _ = quadrature_rule(body.basix_cell(), particles.geometry.quadrature_degree)
+            self._known = AtPoints(as_ufl(known, body, self.name), body, rule)
 
     def at_points(self) -> Array:
         """Return it at the last converged step, shape ``(n, nq)``."""
         body = self._particles
         found: Array = np.zeros((body.num_local, body.num_points))
         if self._known is not None:
-            values = self._known.eval(body.mesh, np.arange(body.num_local, dtype=np.int32))
-            found += float(body.load.value) * np.asarray(values).reshape(found.shape)
+            found += float(body.load.value) * self._known.values()
         return found if self._excess is None else found + self._excess.at_points()
 
     def from_nodes(self) -> None:
         """Return nothing: it is known at points."""
 
 
-def water_in(particles: Particles, known: Any, points: MaterialPoints) -> list[PoreWater | Excess]:
+def water_in(
+    particles: Particles, known: Value | None, points: MaterialPoints
+) -> list[PoreWater | Excess]:
     """Return the pore pressure of a body and what it has in excess, if it has any (collective).
 
     Args:

@@ -28,15 +28,16 @@ from dolfinx import fem
 from ufl.algorithms import extract_coefficients
 from ufl.core.expr import Expr
 
-from ..assembly.inputs import NotNegative, as_expression, facet_measure
+from ..assembly.density import NotNegative
+from ..assembly.loads import facet_measure
 from ..constitutive.strain import Strain
-from ..errors import MPMError, agree, as_ours, not_with
+from ..errors import MPMError, agree, not_with
 from ..materials.base import Material
+from ..meshes.values import as_ufl, interpolated, is_function
 from ..parallel.boundary import collective
-from ..parallel.given import is_number, require_same
+from ..parallel.given import require_same
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
-from ..reals import as_reals
 from .body import Body, PoreFluid, as_given
 from .parts import Contribution
 from .physics import Physics
@@ -163,7 +164,7 @@ class _Water(Physics):
         weight = None
         if given.body_force is not None and pores.density:
             dim = body.mesh.geometry.dim
-            b = as_expression(given.body_force, body, "body_force", (dim,))
+            b = as_ufl(given.body_force, body.mesh, "body_force", (dim,))
             weight = body.load * pores.density * b
         stored = q * (flow.J - flow.J_n) + q * storage * (p - flow.p_n)
         flux = flow.flux(k, p, weight)
@@ -178,14 +179,14 @@ class _Water(Physics):
             degree = flow.p.W.ufl_element().degree
             penalty = PENALTY * degree * flow.undeformed.inverse_size(normal)
             for value, tag in pores.drained:
-                gap = p - as_expression(value, body, "a drained pressure", ())
+                gap = p - as_ufl(value, body.mesh, "a drained pressure")
                 out = -q * ufl.dot(flux, normal) + gap * ufl.dot(slope, inside)
                 out -= penalty * ufl.dot(normal, inside) * gap * q
                 R += area * dt * out * ds(tag)
         if pores.inflow:
             ds = facet_measure(body, given.facet_tags, pores.inflow, "inflow")
             for value, tag in pores.inflow:
-                R += area * dt * as_expression(value, body, "an inflow", ()) * q * ds(tag)
+                R += area * dt * as_ufl(value, body.mesh, "an inflow") * q * ds(tag)
         return R
 
 
@@ -235,7 +236,8 @@ class PorousProblem(TimeProblem, QuasiStaticProblem):
         for filled in self._water.filled:
             fluid = self.body(filled.particles).pore_fluid
             assert fluid is not None
-            _begin_with(filled.field, fluid.pressure)
+            begin = interpolated(fluid.pressure, filled.field.W, "pressure of a PoreFluid")
+            filled.field.set(begin.x.array)
 
     @override
     def laws(self) -> list[list[Law]]:
@@ -468,7 +470,7 @@ def _evaluated(permeability: Any, body: Particles, J: Any) -> Any:
     Raises:
         MPMError: The function that gives it fails.
     """
-    if not callable(permeability) or isinstance(permeability, Expr):
+    if not is_function(permeability):
         return permeability
     comm = body.mesh.comm
     with agree(comm, "The function that gives permeability"):
@@ -547,32 +549,3 @@ def _require_space(given: Any, spaces: Sequence[fem.FunctionSpace]) -> None:
             "pressure_space= must be a scalar space on the background mesh, of a degree below "
             f"{least}, that of the displacement; with as many degrees the pressure would oscillate."
         )
-
-
-def _begin_with(field: ParticleField, value: Any) -> None:
-    """Set a pressure before the first step (collective).
-
-    Raises:
-        MPMError: It is neither a number nor a function of coordinates, or not finite.
-    """
-    with agree(field.W.mesh.comm):
-        if is_number(value):
-            values: Any = float(value)
-        elif callable(value) and not isinstance(value, Expr):
-            x = field.W.tabulate_dof_coordinates().T
-            try:
-                values = as_reals(value(x))
-            except Exception as error:
-                raise as_ours(error, "The function that gives the pore pressure") from error
-            if values.shape != x.shape[1:]:
-                raise MPMError(
-                    f"pore_pressure must return values of the shape {x.shape[1:]} for coordinates "
-                    f"{x.shape}, not {values.shape}."
-                )
-        else:
-            raise MPMError(
-                f"pore_pressure must be a number or a function of coordinates, not {value!r}."
-            )
-        if not np.isfinite(values).all():
-            raise MPMError("pore_pressure must be finite.")
-    field.set(values)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem
 
-from ..assembly.inputs import functions_of
 from ..boundary.supports import Support
 from ..constitutive.assignment import equal_laws
 from ..constitutive.beginning import begin_unstrained, begin_with_stress
@@ -27,7 +26,13 @@ from ..parallel.given import is_number
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
 from ..system.term import Term
-from .arguments import as_bodies, as_supports, as_terms, require_no_conditions_on_bodies
+from .arguments import (
+    as_bodies,
+    as_supports,
+    as_terms,
+    functions_of,
+    require_no_conditions_on_bodies,
+)
 from .body import INITIAL, Body, as_given
 from .initial_stress import initial_stress_at_points, warn_of_other_ground
 from .parts import Contribution

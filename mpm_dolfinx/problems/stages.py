@@ -20,6 +20,7 @@ from ..constitutive.points import MaterialPoints
 from ..errors import MPMError, agree
 from ..io.snapshot import spaces_of
 from ..meshes.regions import in_space, marked
+from ..meshes.tags import cells_with
 from ..particles.particles import Particles
 from ..reals import as_wholes
 from ..system.term import Term
@@ -218,14 +219,15 @@ def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) ->
     """
     if (which is None) == (tags is None):
         raise MPMError("Give either particles= or tags= of what is to be removed.")
-    comm = particles.mesh.comm
+    comm, chosen = particles.mesh.comm, np.zeros(particles.num_local, dtype=bool)
+    if tags is not None:
+        cells = cells_with(particles.mesh, cell_tags, tags, "remove()")
+        chosen[cells[cells < particles.num_local]] = True
     with agree(comm):
-        if tags is not None:
-            chosen, unknown = _tagged(particles, tags, cell_tags)
-        elif callable(which):
+        if callable(which):
             x = in_space(particles.initial_centroid)
-            chosen, unknown = marked(which, x, "The function that chooses particles"), []
-        else:
+            chosen = marked(which, x, "The function that chooses particles")
+        elif which is not None:
             try:
                 indices = as_wholes(which).ravel()
             except (TypeError, ValueError):
@@ -235,13 +237,10 @@ def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) ->
                 ) from None
             lost = np.unique(indices[(indices < 0) | (indices >= particles.num_global)])
             if len(lost):
-                raise _not_there(lost.tolist())
-            chosen, unknown = np.isin(particles.global_index, indices), []
+                raise MPMError(f"There are no cells {', '.join(map(str, lost))} to be removed.")
+            chosen = np.isin(particles.global_index, indices)
     count = comm.allreduce(int((chosen & ~particles.deleted).sum()))
     rest = comm.allreduce(int((~chosen & ~particles.deleted).sum()))
-    unknown = sorted(set.intersection(*[set(u) for u in comm.allgather(unknown)]))
-    if unknown:
-        raise _not_there(unknown)
     if count == 0:
         raise MPMError(
             "No particle is to be removed, or it is removed already: a function is asked at the "
@@ -250,21 +249,3 @@ def chosen_cells(particles: Particles, which: Any, tags: Any, cell_tags: Any) ->
     if rest == 0:
         raise MPMError("Nothing would be left of the body; a problem keeps a part of each body.")
     return np.flatnonzero(chosen & ~particles.deleted)
-
-
-def _not_there(cells: Sequence[int]) -> MPMError:
-    return MPMError(f"There are no cells {', '.join(map(str, cells))} to be removed.")
-
-
-def _tagged(particles: Particles, tags: Any, cell_tags: Any) -> tuple[NDArray[np.bool_], list[int]]:
-    """Return which domains have a tag, and the tags that none has on this rank."""
-    if cell_tags is None:
-        raise MPMError("tags= are of cell_tags=, and the problem has none; give particles=.")
-    try:
-        wanted = np.atleast_1d(as_wholes(tags))
-    except (TypeError, ValueError):
-        raise MPMError(f"tags= are whole numbers, not {tags!r}.") from None
-    own = cell_tags.indices < particles.num_local
-    chosen = np.zeros(particles.num_local, dtype=bool)
-    chosen[cell_tags.indices[own & np.isin(cell_tags.values, wanted)]] = True
-    return chosen, np.setdiff1d(wanted, cell_tags.values).tolist()

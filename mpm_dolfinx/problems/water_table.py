@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import mesh
 
 from ..errors import MPMError
 from ..parallel.given import is_number
@@ -86,20 +85,19 @@ class WaterTable:
         """The function of the level, if it is one; UFL can be called too."""
         return self.level if callable(self.level) and not holds_ufl(self.level) else None
 
-    def __call__(self, domain: mesh.Mesh) -> Any:
-        """Return the pore pressure on a mesh, in UFL.
+    def __call__(self, x: Any) -> Any:
+        """Return the pore pressure at coordinates, in UFL.
 
         Raises:
             MPMError: The function of the level returns no level.
         """
-        x = ufl.SpatialCoordinate(domain)
         level = self.level_at(x)
         if not (holds_ufl(level) or (is_number(level) and np.isfinite(level))):
             raise MPMError(
                 "The level of a WaterTable must be a finite number, or UFL by arithmetic with the "
                 f"coordinates, not {level!r}."
             )
-        below = level - x[domain.geometry.dim - 1]
+        below = level - x[len(x) - 1]
         return ufl.conditional(ufl.gt(below, 0.0), self.weight * below, 0.0)
 
     def on(self, height: Any, x: Array) -> Array:

@@ -17,9 +17,9 @@ import basix
 from dolfinx import fem, mesh
 
 from .. import _compat
-from ..assembly.inputs import is_tag, known_tags
 from ..background.basis import BackgroundBasis
 from ..errors import MPMError, agree
+from ..meshes.tags import require_on_boundary
 from ..parallel.boundary import collective
 from ..parallel.given import as_positive, require_whole
 from ..particles.particles import Particles, require_shared_nodes
@@ -107,10 +107,7 @@ class Tie(Term):
         self.stiffness = as_positive(stiffness, "The stiffness of a Tie")
         if _compat.geometry_degree(a.mesh) > 1:
             raise MPMError("A Tie needs straight facets; exchange the two bodies.")
-        tags = known_tags(a, facet_tags, "A Tie")
-        if not is_tag(tag) or tag not in tags:
-            raise MPMError(f"There is no facet tag {tag!r}; there are {sorted(tags)}.")
-        known_tags(a, facet_tags, "A Tie", [tag])
+        require_on_boundary(a.mesh, facet_tags, [tag], "a Tie")
         super().__init__([a, b])
         self._tags, self._tag = facet_tags, tag
         degree = 2 * a.W.ufl_element().degree if quadrature_degree is None else quadrature_degree

@@ -31,7 +31,7 @@ def test_a_facet_that_is_tagged_twice():
         mpm.MPMError,
         told,
     )
-    raises(lambda: mpm.boundary.fixed(p, twice, 1), mpm.MPMError, r"Supports on it would count")
+    raises(lambda: mpm.boundary.fixed(p, twice, 1), mpm.MPMError, r"supports on it would count")
 
 
 def test_tags_of_another_mesh_or_of_no_boundary():
@@ -44,10 +44,18 @@ def test_tags_of_another_mesh_or_of_no_boundary():
             mpm.Body(p, Hencky(1e3, 0.3), tractions=loads, facet_tags=facets)
         )
 
-    raises(made(tags), mpm.MPMError, r"of the body's mesh, not of another one")
+    raises(
+        made(tags),
+        mpm.MPMError,
+        r"tags of tractions must be those of facets of the present body mesh",
+    )
     inner = scenes.mesh.locate_entities(p.mesh, 1, scenes.at(0, 0.5)).astype(np.int32)
     inside = scenes.mesh.meshtags(p.mesh, 1, np.sort(inner), np.full(len(inner), 1, np.int32))
-    raises(made(inside), mpm.MPMError, r"facets on the boundary, among \[\]")
+    raises(
+        made(inside),
+        mpm.MPMError,
+        r"No facet of the boundary has the tag 1 .* there are \[\]",
+    )
 
 
 def test_one_negative_density():
@@ -63,12 +71,11 @@ def test_one_negative_density():
 @pytest.mark.parametrize("tag", [1.0, [1], True, "1"])
 @pytest.mark.parametrize("what", ["tractions", "pressures", "support"])
 def test_tag_that_is_no_whole_number(tag, what):
-    if what == "support":
-        raises(held("fixed", tag=tag), mpm.MPMError, r"no facet tag .*; there are \[1\]")
-        return
     value = 1.0 if what == "pressures" else (1.0, 0.0)
     build = problem(facet_tags=tags_of_facets, **{what: [(value, tag)]})
-    raises(build, mpm.MPMError, rf"{what} are pairs of a value and a tag")
+    if what == "support":
+        build = held("fixed", tag=tag)
+    raises(build, mpm.MPMError, rf"A tag of {what}s? is a whole number, not .*\.$")
 
 
 @pytest.mark.parametrize("what", ["tractions", "pressures", "support"])

@@ -112,8 +112,8 @@ def test_a_missing_tangent_is_found():
     [
         ({"young": 0.0}, "young is 0 but must be finite, greater than 0"),
         ({"young": np.inf}, "young is inf"),
-        ({"young": "stiff"}, "young must be a number"),
-        ({"young": np.ones((2, 2))}, "young must be a number or one number per point, not 2-D"),
+        ({"young": "stiff"}, "young must be a finite number"),
+        ({"young": np.ones((2, 2))}, "young must be a finite number, one number per point"),
         ({"young": np.array([1.0, -2.0])}, "young is -2"),
         ({"poisson": 0.5}, "poisson is 0.5 but must be .*greater than -1, less than 0.5"),
         ({"poisson": -1.0}, "poisson is -1"),

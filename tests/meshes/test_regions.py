@@ -120,7 +120,7 @@ def test_what_is_not_there_is_refused(domain):
     raises(lambda: mpm.held(V, r=0.0), mpm.MPMError, "no r=")
     raises(lambda: mpm.held(V, x=0.0, where=nowhere), mpm.MPMError, "needs x=, y=, z=")
     raises(lambda: mpm.held(V, x=0.0, value=np.nan), mpm.MPMError, "finite")
-    raises(lambda: mpm.held(V, x=0.0, value=(1.0, 2.0, 3.0)), mpm.MPMError, "or 2 of them")
+    raises(lambda: mpm.held(V, x=0.0, value=(1.0, 2.0, 3.0)), mpm.MPMError, "must have .2,")
     raises(lambda: mpm.held(V, where=lambda x: 1 / 0), mpm.MPMError, "ZeroDivisionError")
     raises(lambda: mpm.facet_tags(domain, {1: nowhere}), mpm.MPMError, "where tag 1")
     raises(lambda: mpm.facet_tags(domain, {}), mpm.MPMError, "needs {tag: where")

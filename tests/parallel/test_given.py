@@ -165,20 +165,20 @@ def test_support_whose_law_fails_on_one_rank():
     )
 
 
-def force_of(domain):
+def force_of(x):
     if LAST:
         raise KeyError("gravity")
     return (0.0, -1.0)
 
 
 def test_force_that_fails_on_one_rank():
-    fails(lambda: made(body_force=force_of), "makes body_force failed with KeyError: 'gravity'")
+    fails(lambda: made(body_force=force_of), "UFL coordinates, failed with KeyError: 'gravity'")
 
 
 @pytest.mark.mpi
 def test_force_that_differs_between_ranks():
     fails(
-        lambda: made(body_force=lambda domain: differing((0.0, -1.0), (0.0, -2.0))),
+        lambda: made(body_force=lambda x: differing((0.0, -1.0), (0.0, -2.0))),
         "^body_force differs",
     )
 

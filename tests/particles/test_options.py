@@ -149,13 +149,13 @@ PARTICLES = {
     "free, one for all": (vectors(free=lambda x: True), r"free= must return one bool for each"),
     "free, foreign tags": (
         vectors(free=(scenes.cell_tags(scenes.unit(1, TRIANGLE), lambda x: x[:, 0]), 1)),
-        r"must be those of cells of the present body mesh",
+        r"tags of free= must be those of cells of the present body mesh",
     ),
     "free, no such tag": (
         tagged((1, 7)),
-        r"No cell has the tag 7 of free=\(tags, tag\); there are \[1\]",
+        r"No cell has the tag 7 of free=; there are \[1\]",
     ),
-    "free, a tag that is true": (tagged(True), r"a whole number, or several, not True"),
+    "free, a tag that is true": (tagged(True), r"A tag of free= is a whole number, not True"),
     "free, no such node": (vectors(free=[10**6]), r"none of the \d+ local ones"),
     "free, no background": (
         lambda: mpm.Particles(scenes.unit(2, TRIANGLE), free=[]),

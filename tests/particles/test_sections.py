@@ -253,6 +253,12 @@ def test_what_makes_no_sense_is_refused():
     fails(lambda: mpm.section_forces(particles, line, 3), "where= is a function")
     tags = mpm.cell_tags(body, {1: mpm.region(x=(0.0, 0.5))})
     fails(lambda: mpm.section_forces(particles, line, (tags, "wall")), "is a whole number")
+    fails(lambda: mpm.section_forces(particles, line, (tags, 2)), "No cell has the tag 2 of where=")
+    other = mpm.cell_tags(box([0, 0], [1, 1], [2, 2], QUADRILATERAL), {1: lambda x: x[0] < 0.5})
+    fails(
+        lambda: mpm.section_forces(particles, line, (other, 1)),
+        "those of cells of the present body",
+    )
     fails(lambda: mpm.section_forces(particles, line, lambda x: x[0]), "one bool for each")
     nowhere = mpm.region(x=(3.0, 4.0))
     fails(lambda: mpm.section_forces(particles, line, nowhere), "is not between points 0 and 1")

@@ -212,10 +212,8 @@ def test_layers_and_surcharge():
         mpm.Body(
             body,
             LAWS[4],
-            density=lambda mesh: ufl.conditional(
-                ufl.gt(ufl.SpatialCoordinate(mesh)[1], 3.0),
-                1.6,
-                ufl.conditional(ufl.gt(ufl.SpatialCoordinate(mesh)[1], 2.0), 2.4, 2.0),
+            density=lambda x: ufl.conditional(
+                ufl.gt(x[1], 3.0), 1.6, ufl.conditional(ufl.gt(x[1], 2.0), 2.4, 2.0)
             ),
             body_force=GRAVITY,
             tractions=[((0.0, -surcharge), 1)],
@@ -389,7 +387,7 @@ AS_IT_IS = {
     "plain": ({}, {}),
     "layers": (
         {"density": [(2.0, 1.5), (3.0, 2.5)]},
-        {"density": lambda m: ufl.conditional(ufl.gt(ufl.SpatialCoordinate(m)[1], 3.0), 1.5, 2.5)},
+        {"density": lambda x: ufl.conditional(ufl.gt(x[1], 3.0), 1.5, 2.5)},
     ),
     "water": ({"water": TABLE}, {"pore_pressure": TABLE}),
     "water above": (
@@ -398,7 +396,7 @@ AS_IT_IS = {
     ),
     "water in UFL": (
         {"water": TABLE},
-        {"pore_pressure": lambda m: 3.0 * (4.0 - ufl.SpatialCoordinate(m)[1])},
+        {"pore_pressure": lambda x: 3.0 * (4.0 - x[1])},
     ),
     "water that slopes": (
         {"water": mpm.WaterTable([(0.0, 2.0), (4.0, 4.0)], 10.0)},
@@ -407,7 +405,7 @@ AS_IT_IS = {
     "no water in it": ({}, {"pore_pressure": mpm.WaterTable(-1.0, 10.0)}),
     "a Function": (
         {"density": 1.0},
-        {"density": lambda m: 0.0 * ufl.SpatialCoordinate(m)[0] + 1.0},
+        {"density": lambda x: 0.0 * x[0] + 1.0},
     ),
     "a part": ({"surface": 9.0}, {"load": (0.0, -80.0)}),
     "surcharge": ({"surcharge": 30.0}, {"load": (0.0, -30.0)}),

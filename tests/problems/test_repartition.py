@@ -77,9 +77,7 @@ def flowing(partition, comm=WORLD, **options):
         particles,
         {1: law, 2: Hencky(1e6, 0.3)},
         density=1000.0,
-        body_force=lambda domain: ufl.as_vector(
-            (0.0, -12.0 + 0.1 * ufl.SpatialCoordinate(domain)[0])
-        ),
+        body_force=lambda x: (0.0, -12.0 + 0.1 * x[0]),
         bcs=[scenes.fix(V, scenes.at(i, 0.0), component=i) for i in (0, 1)],
         cell_tags=tags,
         facet_tags=scenes.facet_tags(body, scenes.at(1, 8.0)),

@@ -327,10 +327,10 @@ def test_ties_that_cannot_be():
     for arguments, sentence in (
         ((left, left, tags, 1, 1e3), "twice"),
         ((left, points, tags, 1, 1e3), "cpdi2"),
-        ((left, right, tags, 3, 1e3), "no facet tag 3"),
+        ((left, right, tags, 3, 1e3), "has the tag 3 of a Tie; there are"),
         ((left, right, tags, 1, -1.0), "positive"),
         ((left, right, tags, 2, 1e3), "only one body"),
-        ((right, left, tags, 1, 1e3), "of another one"),
+        ((right, left, tags, 1, 1e3), "of the present body mesh"),
     ):
         with pytest.raises(mpm.MPMError, match=sentence):
             mpm.Tie(*arguments)
