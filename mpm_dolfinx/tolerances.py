@@ -20,6 +20,7 @@ __all__ = [
     "SLIGHT",
     "SMALL",
     "SOLVED",
+    "UNCERTAIN",
 ]
 
 #: Share of what something is compared with that counts as nothing. Errors of sums and quotients of
@@ -30,6 +31,9 @@ NEGLIGIBLE = 1e-9
 SMALL = 1e-6
 #: Share that can be seen and does not matter, as of a motion that is rigid but for it.
 SLIGHT = 1e-3
+#: Share from which on a warning tells of it: of the motion by errors of time steps, of energy that
+#: is gained, of the deformation that stress tells little of.
+UNCERTAIN = 0.1
 #: What may be left of a residual by what others go on with (inexact methods of Newton).
 INEXACT = 0.1
 #: Relative difference of numbers that are equal but for their last places.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from dolfinx import la
 
 from ..particles.particles import Particles
-from .moduli import bulk_and_shear_moduli
 from .points import MaterialPoints
 
 __all__ = ["stress_errors"]
@@ -18,7 +17,9 @@ __all__ = ["stress_errors"]
 type Array = NDArray[np.float64]
 
 
-def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
+def stress_errors(
+    particles: Particles, points: MaterialPoints, moduli: tuple[Array, Array]
+) -> Array:
     """Return the energy by which the stress differs from a continuous one (collective).
 
     It is the stress beyond the one that the body began with, which is no answer of its elements.
@@ -31,9 +32,10 @@ def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
     Args:
         particles: The body.
         points: Its material.
+        moduli: Bulk and shear modulus of each of its points, undeformed.
 
     Returns:
-        ``int ds : C^-1 : ds + 2/3 mu g^2 dX`` with the undeformed body's moduli, shape ``(n,)``.
+        ``int ds : C^-1 : ds + 2/3 mu g^2 dX``, shape ``(n,)``.
     """
     stress = points.last.gained_stress(particles.point_deformation_gradient)
     stress = stress + np.broadcast_to(points.last.recovery, (len(stress), 3, 3))[:, None]
@@ -45,7 +47,7 @@ def stress_errors(particles: Particles, points: MaterialPoints) -> Array:
         mine = points.laws.numbers == law
         means = _means(particles, at_nodes, weights.sum(axis=1) * mine)
         smooth[mine] = np.einsum("qk,nkij->nqij", shapes, means[mine])
-    bulk, shear = (m.reshape(weights.shape) for m in bulk_and_shear_moduli(points.laws))
+    bulk, shear = (modulus.reshape(weights.shape) for modulus in moduli)
     change = smooth - stress
     mean = np.trace(change, axis1=2, axis2=3) / 3.0
     deviator = change - mean[:, :, None, None] * np.eye(3)

@@ -27,10 +27,10 @@ from ..system.body import StepForce
 from ..system.inertia import Inertia
 from ..system.schemes import Scheme, as_scheme
 from ..system.term import Term
+from ..tolerances import UNCERTAIN
 from .arguments import as_bodies, as_supports, as_terms
 from .body import Body, as_given
 from .motion import (
-    UNCERTAIN,
     MovingProblem,
     initial_velocities,
     initial_velocity,

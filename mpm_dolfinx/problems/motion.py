@@ -28,21 +28,17 @@ from ..stepping.automatic import local_error
 from ..system.inertia import Inertia
 from ..system.schemes import order_of
 from ..system.term import Term
-from ..tolerances import NEGLIGIBLE
+from ..tolerances import NEGLIGIBLE, UNCERTAIN
 from .arguments import as_bodies
 from .through_time import TimeProblem
 
 __all__ = [
-    "UNCERTAIN",
     "MovingProblem",
     "initial_velocities",
     "initial_velocity",
     "rayleigh_of",
     "require_motion",
 ]
-
-#: Share from which on a motion says so: error of the time steps over it, gain over its energies.
-UNCERTAIN = 0.1
 
 
 class MovingProblem(TimeProblem):

@@ -218,6 +218,7 @@ class Run:
         held: How much of what a stage changes was held back at its beginning.
         warned: Whether it has warned of loads that its path sets.
         adaptivity: Frees nodes at the end of steps; ``None``: nothing does.
+        doubt: A warning about its errors, as far as the last step is concerned.
     """
 
     control: Control
@@ -230,6 +231,7 @@ class Run:
     held: float = 0.0
     warned: bool = False
     adaptivity: Adaptivity | None = None
+    doubt: str | None = None
 
     @property
     def remaining(self) -> float:

@@ -153,9 +153,8 @@ class Stepper:
             trial.run = None
             if (sentence := left_outside(owner.bodies, owner.history)) is not None:
                 warn(comm, sentence)
-            if adaptivity is not None and (found := owner.history.steps[-1].error) is not None:
-                if (sentence := adaptivity.complaint(found)) is not None:
-                    warn(comm, sentence)
+            for sentence in self._doubts(run):
+                warn(comm, sentence)
             if interrupted(comm, last.left):
                 self._leave()
         if hold.left:
@@ -203,6 +202,13 @@ class Stepper:
         else:
             trial.converged.parameter = 0.0 if trial.run.shares else trial.converged.load
         return trial.run
+
+    def _doubts(self, run: Run) -> list[str]:
+        """Return warnings that a run that freed nodes ends with."""
+        if run.adaptivity is None or (found := self.trial.owner.history.steps[-1].error) is None:
+            return []
+        every = (run.adaptivity.complaint(found), run.doubt)
+        return [sentence for sentence in every if sentence is not None]
 
     def _try(
         self, run: Run, update: Path | None, control: DisplacementControl | None
@@ -318,6 +324,8 @@ class Stepper:
             except ParticleOutsideError:  # as the last step of a run may leave them
                 break
             steps[-1] = step = replace(step, error=errors.total(owner.bodies))
+            assert trial.run is not None
+            trial.run.doubt = errors.doubt
             chosen = adaptivity.chosen(owner.bodies, errors)
             if not chosen:
                 break

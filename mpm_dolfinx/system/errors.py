@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from dolfinx import fem
 
 from ..assembly.petsc import absolute
+from ..constitutive.moduli import bulk_and_shear_moduli
 from ..constitutive.points import MaterialPoints
 from ..constitutive.recovery import stress_errors
 from ..errors import MPMError
 from ..particles.particles import Particles
-from ..tolerances import SMALL
+from ..tolerances import SMALL, UNCERTAIN
 from .body import BodyTerm
 from .conditions import fixed_dofs
 from .estimate import nodal_errors, shares_of_domains
@@ -34,11 +35,23 @@ class Errors(NamedTuple):
             each body, shape ``(N,)``.
         own: What the bodies' own elements cannot: those of this rank's own domains, ``(n,)``.
         energy: Square of the energy norm of all bodies' deformation.
+        flow: Share of the distortion that is plastic flow, by the work that stress would do on it.
     """
 
     nodal: Sequence[NDArray[np.float64]]
     own: Sequence[NDArray[np.float64]]
     energy: float
+    flow: float = 0.0
+
+    @property
+    def doubt(self) -> str | None:
+        """A warning where much of the deformation is flow, of which stress tells little."""
+        if self.flow <= UNCERTAIN:
+            return None
+        return (
+            "More than a tenth of the distortion is plastic flow. The estimated error is that of "
+            "the stress; strains, and displacements with them, may err by several times as much."
+        )
 
     def total(self, bodies: Sequence[Particles]) -> float:
         """Return the error over the size of the deformation (collective)."""
@@ -81,19 +94,23 @@ def estimated(
             f"any more, {size:.6g}, of which error() tells: loads, conditions or obstacles have "
             "been changed since; ask before, or set them as they were."
         )
-    nodal, own, energy = [], [], 0.0
+    nodal, own, sizes = [], [], np.zeros(3)
     for body, term, force in zip(bodies, terms, forces, strict=False):
         field = next(field for field in reduced.fields if any(b is body for b in field.bodies))
         free = _unprescribed(body, list(field.prescribed))
         nodal.append(nodal_errors(body, reduced.terms, force, free))
         points = term.forms.internal
         if isinstance(points, MaterialPoints):
-            own.append(stress_errors(body, points))
+            moduli = bulk_and_shear_moduli(points.laws)
+            own.append(stress_errors(body, points, moduli))
+            sizes += _sizes(body, points, moduli[1])
         else:
             own.append(np.zeros(body.num_local))
-        energy += _energy(body, term, force)
+            inner = force - term.forms.external.array_r
+            sizes[0] += float(inner @ body.converged_displacement[: len(force)])
     reduced.terms.roll_back()
-    return Errors(nodal, own, abs(bodies[0].mesh.comm.allreduce(energy)))
+    energy, distortion, flow = bodies[0].mesh.comm.allreduce(sizes)
+    return Errors(nodal, own, abs(float(energy)), float(flow / distortion) if flow > 0.0 else 0.0)
 
 
 def _unprescribed(body: Particles, conditions: Sequence[fem.DirichletBC]) -> NDArray[np.float64]:
@@ -107,27 +124,34 @@ def _unprescribed(body: Particles, conditions: Sequence[fem.DirichletBC]) -> NDA
     return np.asarray(np.where(every > 0.0, free / np.where(every > 0.0, every, 1.0), 0.0))
 
 
-def _energy(body: Particles, term: BodyTerm, force: NDArray[np.float64]) -> float:
-    """Return this rank's part of the square of a body's energy norm.
+def _sizes(
+    body: Particles, points: MaterialPoints, shear: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return this rank's part of the square of a body's energy norm, and of what that consists.
 
     With parts of the mean and of the deviator of ``tau``, beyond the stress that the body began
     with, and of ``ln V`` it is the integral of ``|p v| + |s| |e|``: twice the energy of an
     isotropic elastic body of Hencky's law; and where plastic flow has left strain, it does not
-    vanish as the body is unloaded. Without a material it is the work of the forces that depend on
-    the displacement.
+    vanish as the body is unloaded.
+
+    Args:
+        body: The body.
+        points: Its material.
+        shear: The shear modulus of each point.
+
+    Returns:
+        That square; the part of distortion in it, the integral of ``|s| |e|``; and what plastic
+        flow has of this, where there was any, ``|s| (|e| - |s| / 2 mu)``.
     """
-    points = term.forms.internal
-    if not isinstance(points, MaterialPoints):
-        own = len(force)
-        inner = force - term.forms.external.array_r
-        return float(inner @ body.converged_displacement[:own])
     F = body.point_deformation_gradient
     squares, axes = np.linalg.eigh(F @ F.swapaxes(-1, -2))
     strain = np.einsum("nqik,nqk,nqjk->nqij", axes, 0.5 * np.log(squares), axes)
     stress = np.linalg.det(F)[..., None, None] * points.last.gained_stress(F)
     (p, s), (v, e) = (_parts(tensor) for tensor in (stress, strain))
-    density = 3.0 * np.abs(p * v) + s * e
-    return float((points.weights * density)[~body.deleted].sum())
+    elastic = s / (2.0 * shear.reshape(s.shape))
+    flows = points.last.plastic_strain() > 0.0
+    densities = np.array([3.0 * np.abs(p * v) + s * e, s * e, flows * s * (e - elastic)])
+    return np.asarray((points.weights * densities)[:, ~body.deleted].sum(axis=(1, 2)))
 
 
 def _parts(tensor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """The estimated error beside the true one, known or by fine finite elements of degree 2."""
 
+import warnings
 from functools import cache
 
 from mpi4py import MPI
@@ -26,6 +27,7 @@ from scenes import (
     total,
     vectors,
 )
+from scipy.spatial import cKDTree
 
 import basix.ufl
 import ufl
@@ -354,6 +356,71 @@ def test_initial_stress_is_no_deformation(degree, mpi_tmp_path):
     assert again.error() == pytest.approx(heavy.error(), rel=1e-9)
 
 
+CLAY = materials.VonMises(1e3, 0.3, rho_y=np.sqrt(2.0))  # its strip bears 2 + pi = 5.14
+SAND = materials.MohrCoulomb(1e3, 0.3, 1.0, 20.0, dilation_angle=20.0)  # and this one's 14.83
+
+
+@cache
+def pressed(law, cells, degree, offset, load, free=False):
+    """Return ground that a strip loads in steps."""
+    problem, pressure = ground(cells, degree, offset, free, law)
+
+    def path(t):
+        problem.particles.load.value = 1.0
+        pressure.value[1] = -load * t
+
+    problem.solve(4, update=path)
+    return problem
+
+
+def at_points(problem):
+    """Return places, weights, stress and logarithmic strain of a body's points."""
+    body, points = problem.particles, problem.points[0]
+    F = body.point_deformation_gradient
+    squares, axes = np.linalg.eigh(F @ F.swapaxes(-1, -2))
+    strain = np.einsum("nqik,nqk,nqjk->nqij", axes, 0.5 * np.log(squares), axes)
+    stress = points.last.gained_stress(F)
+    places = np.einsum("qk,nki->nqi", body.undeformed.rule.shapes, body.initial_domains)
+    weights = points.weights.reshape(-1, 1, 1)
+    return places.reshape(-1, 2), weights, *(v.reshape(-1, 3, 3) for v in (stress, strain))
+
+
+def stress_off_by(problem, fine, shear=1e3 / 2.6, bulk=1e3 / 1.2):
+    """Return the error of a stress beside that of fine finite elements, in energy."""
+
+    def parts(v):
+        mean = np.trace(v, axis1=1, axis2=2)[:, None, None] / 3.0
+        return mean, np.linalg.norm(v - mean * np.eye(3), axis=(1, 2))[:, None, None]
+
+    places, _, stress, _ = at_points(problem)
+    there, weights, exact, strain = at_points(fine)
+    off, size = parts(stress[cKDTree(places).query(there)[1]] - exact), parts(exact)
+    whole = 3.0 * np.abs(size[0] * parts(strain)[0]) + size[1] * parts(strain)[1]
+    energy = off[0] ** 2 / bulk + off[1] ** 2 / (2.0 * shear)
+    return np.sqrt((weights * energy).sum() / (weights * whole).sum())
+
+
+@pytest.mark.skip_in_parallel
+@pytest.mark.parametrize("size", [(4, 1), *slow((4, 2), (8, 1), (8, 2))])
+@pytest.mark.parametrize("offset", [0.37, *slow(0.0)])
+@pytest.mark.parametrize(
+    "case",
+    [(CLAY, 4.8, True), (SAND, 10.0, True), *slow((CLAY, 2.3, False), (SAND, 5.0, False))],
+    ids=["clay near its limit", "sand near its limit", "clay that hardly yields", "sand"],
+)
+def test_where_ground_yields_it_is_the_error_of_the_stress(case, offset, size):
+    """And that of strains, which is three to six times as large, is told of."""
+    (law, load, flows), (cells, degree) = case, size
+    fine = pressed(law, 16 if cells == 8 else 8, 2, 0.0, load, free=True)
+    problem = pressed(law, cells, degree, offset, load)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = problem.error()
+    assert any("plastic flow" in str(one.message) for one in told) == flows
+    assert 0.5 < found / stress_off_by(problem, fine) < 1.3
+
+
+@pytest.mark.filterwarnings("ignore:More than a tenth of the distortion")
 def test_strain_that_plastic_flow_has_left_is_deformation():
     """Ground that is unloaded has errors of the size that it had under the load."""
     law = materials.VonMises(1e3, 0.3, rho_y=np.sqrt(2.0))
