@@ -129,6 +129,8 @@ def _residuals(ax: Any, run: History) -> None:
         share = number / max(len(run.steps) - 1, 1)
         residuals = np.maximum(step.residuals, 1e-18)
         ax.semilogy(residuals, ".-", color=cold * (1.0 - share), linewidth=0.8, markersize=3)
+    # A step that begins by moving something has nothing yet that its residual is relative to.
     ax.set(xlabel="Newton iteration", ylabel="relative residual")
+    ax.set_ylim(top=min(ax.get_ylim()[1], 1e3))
     ax.set_title("Each step; the last one is black", fontsize="medium")
     ax.xaxis.get_major_locator().set_params(integer=True)

@@ -182,6 +182,17 @@ def test_history_of_loads_and_of_a_curve(solved):
         assert curve.axes[0].get_ylabel() == "force, N"
 
 
+def test_residuals_of_a_step_that_begins_without_forces_leave_the_others_to_be_seen():
+    """A stiff tool that is pressed in has 1e20 of nothing at first: that is not the scale."""
+    problem = block()
+    problem.solve(steps=2)
+    problem.history.steps[0].residuals[0] = 1e20
+    figure = mpm.plot.history(problem)
+    if WORLD.rank == 0:
+        low, high = figure.axes[3].get_ylim()
+        assert low < 1e-9 and high <= 1e3
+
+
 def test_history_of_a_motion_shows_energies():
     V = vectors(box([0.0, 0.0], [2.0, 2.0], [4, 4], TRIANGLE))
     particles = mpm.Particles(box([0.5, 1.0], [1.0, 1.5], [2, 2], TRIANGLE), V)
