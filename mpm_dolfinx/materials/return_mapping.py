@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConvergenceError
-from ..tolerances import LAST_PLACES, LOCAL_ITERATIONS, ROUND_OFF, SOLVED
+from ..tolerances import LAST_PLACES, ROUND_OFF, SLIGHT, SOLVED
 from .base import Integration, State
 from .derivatives import difference_by_stress, slope_by_plastic_strain, slope_by_stress
 from .mandel import norm
@@ -292,11 +292,12 @@ def _solve(system: _System, max_iterations: int) -> tuple[NDArray[np.float64], N
         new_residual = now.residual(new)
         new_size = norm(new_residual) / goal[active]
         at_floor = old_size <= SOLVED  # round-off may be what stops the decrease
-        for _ in range(LOCAL_ITERATIONS):
+        share = 1.0
+        while share > SLIGHT:  # (less creeps where nothing is found)
             (rising,) = np.nonzero(~(new_size < old_size) & ~at_floor)
             if len(rising) == 0:
                 break
-            step[rising] *= 0.5
+            share, step[rising] = 0.5 * share, 0.5 * step[rising]
             new[rising] = old[rising] + step[rising]
             new_residual[rising] = now.at(rising).residual(new[rising])
             new_size[rising] = norm(new_residual[rising]) / goal[active[rising]]

@@ -205,10 +205,12 @@ class MovingProblem(TimeProblem):
         self._told_of_steps = True
         times = [energy.time for energy in self._energies]
         longest = float(np.diff(times).max())
+        share = f"{100.0 * error:.0f} %" if error < 1.0 else "as large as all"
         warn(
             self._comm,
-            f"Time steps of {longest:.3g} are too coarse: their error is estimated to be "
-            f"{100.0 * error:.2g} % of the motion; take dt <= {longest * UNCERTAIN / error:.2g}.",
+            f"Time steps of {longest:.3g} are too coarse: their error is estimated to be {share} "
+            f"of the motion, if it does not only lead to rest, which forgets it; take "
+            f"dt <= {longest * UNCERTAIN / error:.2g}.",
         )
 
     @override
