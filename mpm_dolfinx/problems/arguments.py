@@ -384,6 +384,30 @@ def require_no_conditions_on_bodies(
         raise MPMError(f"Dirichlet conditions on W lie on the present body mesh, so {consequence}.")
 
 
+def require_joined(bodies: Sequence[Particles], terms: Sequence[Term]) -> None:
+    """Raise an error where bodies on one background would pass through each other.
+
+    They stick by nodes that it carries, of which ``free="auto"`` leaves none.
+
+    Args:
+        bodies: The bodies.
+        terms: What acts on them, of which contacts and ties couple two.
+    """
+    for body in bodies:
+        if body.free_nodes is None or not body.free_nodes.automatic:
+            continue
+        for other in bodies:
+            if other is body or other.V is not body.V:
+                continue
+            if not any(body in term.bodies and other in term.bodies for term in terms):
+                raise MPMError(
+                    "Bodies on one background stick by nodes that it carries, and free='auto' "
+                    "leaves none: they would pass through each other; give each its own V, such as "
+                    "a second function space on the same mesh, and couple them by a contact.Pair, "
+                    "or make the particles with free=[]."
+                )
+
+
 def functions_of(assignment: Any) -> list[fem.Function]:
     """Return the Functions among the parameters of materials."""
     if isinstance(assignment, Mapping):

@@ -53,6 +53,7 @@ from .arguments import (
     as_conditions,
     as_terms,
     by_space,
+    require_joined,
 )
 from .names import OwnNames
 from .parts import Built, Contribution, Parts
@@ -179,6 +180,7 @@ class Problem(Hooks, OwnNames):
             [term.field for term in self.terms if isinstance(term, FieldEquation)],
         )
         built = self.built = parts.built()
+        require_joined(self.bodies, self.terms)
         for term in self.terms:
             materials = [given.stress for given in built.contributions]
             term.take_part(self.state.number(term), self.bodies, materials)

@@ -92,6 +92,7 @@ FEATURES = {
     "finite elements": {"method": "fem"},
     "free nodes": {"method": "cpdi2", "free": "some"},
     "adaptivity": {"method": "cpdi2", "free": "found"},
+    "free as long as they last": {"method": "cpdi2", "free": "auto"},
     "length": {"law": softening(), "length": 0.6},
     "Fracture": {"law": Fracture(Hencky(YOUNG, POISSON), 10.0, 1.2, model="AT2")},
     "Truss": {"truss": True},
@@ -214,7 +215,7 @@ class Scene:
             degree=self.degree,
             quadrature_degree=self.wanted.get("quadrature") if self.degree == 1 else None,
             outside="delete" if "delete" in self.wanted else "error",
-            free={"some": free, "found": []}.get(self.wanted.get("free")),
+            free={"some": free, "found": [], "auto": "auto"}.get(self.wanted.get("free")),
         )
 
     def base(self, V, bottom, value):
@@ -786,6 +787,98 @@ def test_a_feature_with_an_estimate_of_the_error(feature):
     shares = [scene.problem.error_of_particles(i) for i in range(len(scene.problem.bodies))]
     whole = WORLD.allreduce(sum(float((own**2).sum()) for own in shares))
     assert whole == pytest.approx(scene.problem.error() ** 2, rel=1e-9)
+
+
+# -- All nodes free --------------------------------------------------------------------------
+
+#: What changes meshes or ranks, asks for nodes to be carried, or acts on the background itself.
+NOT_OF_ELEMENTS = (
+    *APART,
+    *("bodies on one V", "split", "rebase", "repartition", "checkpoint", "delete"),
+    *("background form", "mixed pressure", "stabilised pressure"),
+    *("finite elements", "free nodes", "adaptivity", "free as long as they last"),
+)
+
+
+def outcome(scene):
+    """Return where particles are, their stress, and the vertical forces on what holds them."""
+    problem = scene.problem
+    found = {}
+    for number, body in enumerate(problem.bodies):
+        for name in ("centroid", "stress"):
+            found[name, number] = scenes.in_order(body, getattr(body, name))
+    held = [*scene.bases, *scene.supports, *([scene.contact] if scene.contact else [])]
+    found["forces", 0] = np.array([problem.reaction(one)[-1] for one in held])
+    return found
+
+
+def require_equal(one, other, tolerance):
+    """Compare outcomes, relative to the largest value of each kind."""
+    for key, values in one.items():
+        gap = np.abs(values - other[key]).max()
+        assert gap < tolerance * np.abs(values).max(), (key, gap)
+
+
+@pytest.mark.parametrize(
+    "feature",
+    all_but(
+        ("f_bar patch", "Tie", "RigidBody", "path", "length", "Truss"),
+        [f for f in FEATURES if f not in NOT_OF_ELEMENTS],
+    ),
+)
+def test_all_nodes_free_are_finite_elements_and_may_be_carried(feature):
+    """With what moves on the background's own lines, too; as they are carried nothing moves."""
+    runs = []
+    for nodes in ("finite elements", "free as long as they last"):
+        scene = Scene({"rtol": 1e-13} | FEATURES[feature] | FEATURES[nodes])
+        scene.problem.solve()
+        runs.append(scene)
+    elements, scene = runs
+    require_equal(outcome(elements), outcome(scene), 1e-8)
+    problem = scene.problem
+    for _ in range(2):  # (from where the step's background, contact and averages are those of now)
+        problem.step()
+    before, error = outcome(scene), problem.error()
+    for body in problem.bodies:
+        body.free = []
+    require_equal(before, outcome(scene), 1e-15)
+    assert problem.error() == pytest.approx(error, rel=1e-4)
+    problem.step()
+    require_equal(before, outcome(scene), 1e-6)
+    for other in runs:
+        for _ in other.steps():
+            other.require_equilibrium()
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+@pytest.mark.parametrize(
+    "feature",
+    all_but(
+        ("VonMises", "contact"),
+        [f for f in FEATURES if f not in (*NOT_OF_ELEMENTS, *STILL)],
+    ),
+)
+@pytest.mark.filterwarnings("ignore:Time steps of")
+def test_all_nodes_free_move_as_finite_elements_do(feature, scheme):
+    """Let go, and led by lines of the background that move; the account closes over a change."""
+    if frozenset((feature, scheme)) in IN_MOTION:
+        return
+    runs = []
+    for nodes in ("finite elements", "free as long as they last"):
+        scene = Moving({"rtol": 1e-13} | FEATURES[feature] | FEATURES[nodes], scheme)
+
+        def path(t, scene=scene):
+            scene.wall.value[-1] = 0.02 * t
+
+        scene.problem.solve(time=0.03, dt=0.01, update=path)
+        runs.append(scene)
+    require_equal(outcome(runs[0]), outcome(runs[1]), 1e-8)
+    for body in scene.problem.bodies:
+        body.free = []
+    scene.problem.solve(time=0.05, dt=0.01, update=path)
+    energies = scene.problem.history.energies
+    size = max(max(energy.kinetic, abs(energy.external)) for energy in energies)
+    assert np.ptp([energy.balance for energy in energies]) < 1e-9 * size
 
 
 # -- Equals ------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from compare import raises
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, at
 
 import mpm_dolfinx as mpm
@@ -220,6 +221,49 @@ def test_a_step_that_fails_leaves_free_nodes_as_they_were(how):
         problem.step()
         ends.append(scenes.in_order(own, own.centroid))
     np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-12)
+
+
+def test_bodies_that_would_pass_through_each_other_are_refused():
+    """Those on one background, of which the nodes of one are free and nothing couples them."""
+
+    def made():
+        V = scenes.vectors(scenes.box([0.0, 0.0], [3.0, 3.0], [6, 6], QUADRILATERAL))
+        bodies = [
+            mpm.Body(
+                mpm.Particles(
+                    scenes.box([0.5, y], [2.5, y + 1.0], [4, 2], QUADRILATERAL),
+                    V,
+                    free=free,
+                    quadrature_degree=2,
+                ),
+                RUBBER,
+                density=1.0,
+                body_force=(0.0, -10.0),
+            )
+            for y, free in ((0.0, "auto"), (1.0, []))
+        ]
+        lower, upper = (body.particles for body in bodies)
+        tags = scenes.facet_tags(upper.mesh, at(1, 1.0))
+        tie = mpm.Tie(upper, lower, tags, 1, 1e6)
+        return bodies, [mpm.held(V, y=0.0), mpm.held(V, 0, x=0.0)], tie
+
+    says = "leaves none: they would pass through each other"
+    bodies, sides, _ = made()
+    raises(lambda: mpm.QuasiStaticProblem(bodies, bcs=sides), mpm.MPMError, says)
+    problem = mpm.QuasiStaticProblem(bodies[0], bcs=sides)
+    problem.solve(1)
+    before = scenes.in_order(problem.particles, problem.particles.centroid)
+    raises(lambda: problem.add(bodies[1]), mpm.MPMError, says)
+    problem.step()
+    after = scenes.in_order(problem.particles, problem.particles.centroid)
+    np.testing.assert_allclose(after, before, atol=1e-12)
+    bodies, sides, tie = made()
+    tied = mpm.QuasiStaticProblem(bodies, bcs=sides, terms=[tie])
+    tied.solve(2)
+    assert tied.reaction(tie)[1] == pytest.approx(20.0, rel=1e-6)
+    raises(lambda: tied.stage("apart", terms=[]), mpm.MPMError, says)
+    tied.step()
+    assert tied.reaction(tie)[1] == pytest.approx(20.0, rel=1e-6)
 
 
 def test_conditions_on_its_own_nodes_are_refused():
