@@ -50,7 +50,7 @@ class ReferenceForms(BodyForms):
     def __init__(self, R, J, particles, internal=None, low_rank=None, others=(), **options):
         self._stress = internal
         if internal is not None:
-            strain = self._strain = strain_of(particles, internal.hoop is not None)
+            strain = self._strain = strain_of(particles, internal.strain.hoop is not None)
             dim = strain.dim
             P = particles.quadrature_function("first_piola", (dim, dim))
             A = particles.quadrature_function("tangent", (dim,) * 4)
@@ -145,7 +145,7 @@ class ReferencePressure(PressureTerm):
     def tangents(self):
         found = self._material.volume_strain
         diagonal = self._force.duplicate()
-        diagonal.array_w[:] = -self._material.weights.ravel() * found.compliance
+        diagonal.array_w[:] = -self._material.strain.weights.ravel() * found.compliance
         if self._mats is None:
             self._mats = self._matrices()
         of_strain, of_stress, by_points, alone = self._mats

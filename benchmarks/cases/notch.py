@@ -318,7 +318,7 @@ def measured() -> tuple[float, float, float]:
         values = [kit.total(fem.assemble_scalar(form)) for form in problem.forms]
         return values[0], values[1], values[2]
     points = problem.points[0]
-    stored = kit.total(points.last.strain_energy() * points.weights.ravel())
+    stored = kit.total(points.last.strain_energy() * points.strain.weights.ravel())
     return float(problem.reaction(grip)[along]), problem.damage[0].surface_energy(), stored
 
 

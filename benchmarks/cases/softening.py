@@ -140,7 +140,7 @@ except mpm.MPMError as error:
 
 # Second moments of the plastic strain rate about its middle.
 
-rate = points.weights * (last - before)
+rate = points.strain.weights * (last - before)
 nodes = particles.W.tabulate_dof_coordinates()[particles.domain_nodes, :2]
 places = np.einsum("qk,nki->nqi", particles.undeformed.rule.shapes, nodes)
 whole = max(kit.total(rate), 1e-300)

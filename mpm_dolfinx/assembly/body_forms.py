@@ -20,6 +20,7 @@ from dolfinx.fem import petsc as fem_petsc
 from .. import _compat
 from .._core import loops
 from ..constitutive.averaging import Linearised, LowRankTerm
+from ..constitutive.strain import Strain
 from ..errors import MPMError
 from ..meshes.quadrature import nodal_forces, with_hoop
 from ..parallel.compilation import compiled_form
@@ -63,12 +64,8 @@ class PointStress(Protocol):
         """Whether the tangent has major symmetry."""
 
     @property
-    def weights(self) -> NDArray[np.float64]:
-        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
-
-    @property
-    def hoop(self) -> NDArray[np.float64] | None:
-        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``; dim is 3 then."""
+    def strain(self) -> Strain:
+        """Strain of the points."""
 
 
 class BodyForms:
@@ -244,8 +241,8 @@ class BodyForms:
         loops.internal_force(
             np.ascontiguousarray(first_piola),
             *self._domains,
-            internal.weights,
-            no_values if internal.hoop is None else internal.hoop,
+            internal.strain.weights,
+            no_values if internal.strain.hoop is None else internal.strain.hoop,
             force,
         )
         return force
@@ -371,8 +368,8 @@ class BodyForms:
         """Return the internal pointwise tangent times local values on W, at own and ghost dofs."""
         nodal = self._at_domains(values)
         gradient = self._particles.undeformed.rule.displacement_gradient(nodal)
-        if internal.hoop is not None:
-            gradient = with_hoop(gradient, internal.hoop, nodal)
+        if internal.strain.hoop is not None:
+            gradient = with_hoop(gradient, internal.strain.hoop, nodal)
         gradient = gradient.reshape(internal.first_piola.shape)
         stress = np.einsum("niJkL,nkL->niJ", internal.tangent, gradient)
         return self._force_of(internal, stress)
@@ -426,9 +423,9 @@ class BodyForms:
         """Return the forces of the stress in some domains on their nodes, ``(n, k, gdim)``."""
         if self.internal is None:
             return 0.0
-        weights, hoop = self.internal.weights[part], self.internal.hoop
+        weights, hoop = self.internal.strain.weights[part], self.internal.strain.hoop
         P = self.internal.first_piola.reshape(
-            *self.internal.weights.shape, *self.internal.first_piola.shape[1:]
+            *self.internal.strain.weights.shape, *self.internal.first_piola.shape[1:]
         )
         gradients = self._particles.undeformed.rule.gradients[part]
         return nodal_forces(P[part], weights, gradients, None if hoop is None else hoop[part])

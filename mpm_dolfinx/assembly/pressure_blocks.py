@@ -13,6 +13,7 @@ from dolfinx import fem
 
 from .._core import loops
 from ..constitutive.pressure import VolumeStrain
+from ..constitutive.strain import Strain
 from ..particles.field import CarriedField
 from ..particles.particles import Particles
 from .blocks import CoupledBlocks
@@ -25,12 +26,8 @@ class PressurePoints(Protocol):
     """A material whose mean stress is a pressure of its own."""
 
     @property
-    def weights(self) -> NDArray[np.float64]:
-        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
-
-    @property
-    def hoop(self) -> NDArray[np.float64] | None:
-        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
+    def strain(self) -> Strain:
+        """Strain of the points."""
 
     @property
     def volume_strain(self) -> VolumeStrain:
@@ -68,11 +65,11 @@ class PressureBlocks:
     @property
     def _domains(self) -> tuple[NDArray[np.int32], *tuple[NDArray[np.float64], ...]]:
         """Data of the domains for the compiled loops."""
-        hoop = self._material.hoop
+        hoop = self._material.strain.hoop
         return (
             self._particles.domain_nodes,
             self._particles.undeformed.rule.gradients,
-            self._material.weights,
+            self._material.strain.weights,
             no_values if hoop is None else hoop,
         )
 
@@ -84,7 +81,7 @@ class PressureBlocks:
         if not self._material.symmetric:
             slope = np.ascontiguousarray(self._material.by_pressure)
             loops.assemble_slopes(*self._domains, slope, *places, None, blocks.of_displacement)
-        weights = self._material.weights
+        weights = self._material.strain.weights
         factors = -weights * found.compliance.reshape(weights.shape)
         loops.assemble_diagonal(factors, blocks.field, blocks.alone)
 
@@ -100,7 +97,7 @@ class PressureBlocks:
         Returns:
             Shape ``(n nq,)``.
         """
-        found, weights = self._material.volume_strain, self._material.weights
+        found, weights = self._material.volume_strain, self._material.strain.weights
         values = self._change.x
         values.array[: len(moved)] = moved
         values.scatter_forward()

@@ -96,7 +96,7 @@ class BodyLoops:
         self._domains = (particles.domain_nodes, particles.undeformed.rule.gradients)
         internal = forms.internal
         one = particles.num_points == 1
-        self._points = internal is not None and one and internal.hoop is None
+        self._points = internal is not None and one and internal.strain.hoop is None
         whole = bool(forms.fused) or (internal is not None and not self._points)
         self._whole = whole or coupled
         body = particles.mesh
@@ -145,7 +145,7 @@ class BodyLoops:
         if internal is not None and self._points:
             loops.assemble_points(
                 *self._domains,
-                self._counted(internal.weights),
+                self._counted(internal.strain.weights),
                 self._gradients,
                 internal.tangent,
                 internal.symmetric,
@@ -154,8 +154,8 @@ class BodyLoops:
         elif internal is not None:
             loops.assemble_domains(
                 *self._domains,
-                self._counted(internal.weights),
-                no_values if internal.hoop is None else internal.hoop,
+                self._counted(internal.strain.weights),
+                no_values if internal.strain.hoop is None else internal.strain.hoop,
                 self.transfers,
                 internal.tangent,
                 self._vectors(self._forms.low_rank_of_domains()),

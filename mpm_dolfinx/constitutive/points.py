@@ -126,8 +126,6 @@ class MaterialPoints:
         """
         return axial_modulus(self.laws)
 
-    # -- How updates are asked for -----------------------------------------------------------
-
     # -- What steps begin with -----------------------------------------------------------------
 
     def remember(self, average: NDArray[np.float64], growth: NDArray[np.float64] | None) -> None:
@@ -198,16 +196,6 @@ class MaterialPoints:
     def grouped(self) -> VolumeAveraging | None:
         """Part of the tangent from other points of a group; ``None`` without F-bar."""
         return self.averaging
-
-    @property
-    def weights(self) -> NDArray[np.float64]:
-        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
-        return self.strain.present_volumes()
-
-    @property
-    def hoop(self) -> NDArray[np.float64] | None:
-        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
-        return self.strain.hoop
 
     @property
     def volume_strain(self) -> VolumeStrain:

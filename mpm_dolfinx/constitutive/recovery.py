@@ -39,7 +39,7 @@ def stress_errors(
     """
     stress = points.last.gained_stress(particles.point_deformation_gradient)
     stress = stress + np.broadcast_to(points.last.recovery, (len(stress), 3, 3))[:, None]
-    weights = points.weights
+    weights = points.strain.weights
     at_nodes = _continued(particles, stress, weights)
     smooth = np.empty_like(stress)
     shapes = particles.undeformed.rule.shapes

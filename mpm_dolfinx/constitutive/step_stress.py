@@ -34,13 +34,13 @@ from numpy.typing import NDArray
 from .._core import loops
 from ..meshes.quadrature import volume_ratio
 from ..particles.reference import Reference
-from .averaging import Linearised, LowRankTerm, VolumeAveraging
+from .averaging import Linearised, LowRankTerm
 from .discrete_gradient import Ends, Gradients, abandon, by_end, mean, mean_of_groups
 from .energies import elastic_energy, has_potential, potential_energy
 from .groups import Groups
 from .moduli import undeformed_tangent
 from .points import MaterialPoints
-from .pressure import MeanStress, VolumeStrain, is_linear_in_volume, slope_of_volume
+from .pressure import VolumeStrain, is_linear_in_volume, slope_of_volume
 
 __all__ = ["StepStress"]
 
@@ -221,13 +221,18 @@ class StepStress:
         share: As :meth:`pace` gives it.
 
     Attributes:
+        points: As given.
+        strain: What they are strained in.
+        averaging: F-bar, or ``None``.
+        mean_stress: A pressure of its own in place of the mean stress, or ``None``.
         symmetric: Whether the tangent is symmetric.
     """
 
     def __init__(
         self, points: MaterialPoints, conserving: bool, viscosity: float, share: float
     ) -> None:
-        self._points = points
+        self.points, self.strain = points, points.strain
+        self.averaging, self.mean_stress = points.averaging, points.mean_stress
         self._conserving, self._viscosity = conserving, viscosity
         self._dt, self._share = 1.0, share
         self._muted = False
@@ -246,45 +251,20 @@ class StepStress:
         self._begin, self._found = self._settled(first)
 
     @property
-    def points(self) -> MaterialPoints:
-        """The material with its history."""
-        return self._points
-
-    @property
-    def weights(self) -> Array:
-        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
-        return self._points.weights
-
-    @property
-    def hoop(self) -> Array | None:
-        """Hoop strains of a body of revolution's nodes, or ``None``."""
-        return self._points.hoop
-
-    @property
-    def averaging(self) -> VolumeAveraging | None:
-        """F-bar, or ``None``."""
-        return self._points.averaging
-
-    @property
-    def mean_stress(self) -> MeanStress | None:
-        """A pressure of its own in place of the mean stress, or ``None``."""
-        return self._points.mean_stress
-
-    @property
     def volume_strain(self) -> VolumeStrain:
         """The strain of which a pressure of its own is the multiplier, at the step's end.
 
         It counts ``1 / share`` times, as its pressure does: the tangent of small strains is
         symmetric then.
         """
-        found = self._points.volume_strain
+        found = self.points.volume_strain
         return VolumeStrain(*(part / self._share for part in found))
 
     @property
     def by_pressure(self) -> Array:
         """Derivative of the stress by a pressure of its own, shape ``(n nq, dim, dim)``."""
         found = self._found.by_pressure
-        return self._points.by_pressure if found is None else found
+        return self.points.by_pressure if found is None else found
 
     @property
     def first_piola(self) -> Array:
@@ -293,7 +273,7 @@ class StepStress:
             return self._found.stress
         if self._conserving:
             return np.zeros_like(self._found.stress)
-        return self._points.first_piola if self._found.own is None else self._found.own
+        return self.points.first_piola if self._found.own is None else self._found.own
 
     @property
     def tangent(self) -> Array:
@@ -303,7 +283,7 @@ class StepStress:
     @property
     def grouped(self) -> Linearised | None:
         """The low-rank part of the tangent, from a group's other points; ``None`` without F-bar."""
-        averaging = self._points.averaging
+        averaging = self.points.averaging
         if averaging is None or not self._conserving:
             return averaging
         return _OfGroups(lambda: self._found, averaging.groups)
@@ -313,8 +293,8 @@ class StepStress:
     def pace(self, dt: float, share: float) -> None:
         """See :meth:`system.term.Term.pace`."""
         self._dt, self._share = dt, share
-        self._points.laws.pace(dt)
-        if _reference(self._points) is not self._begin.reference:
+        self.points.laws.pace(dt)
+        if _reference(self.points) is not self._begin.reference:
             self.settle()
 
     def mute(self, muted: bool) -> None:
@@ -340,7 +320,7 @@ class StepStress:
             found: The last evaluation.
             trial: Whether that is of a step which is not committed.
         """
-        points, part, volume = self._points, self._part, None
+        points, part, volume = self.points, self._part, None
         H = _gradient(points).copy()  # (which is that of the points until they are strained again)
         stress = points.first_piola.copy()
         potential = potential_energy(points, trial) if self._conserving else None
@@ -362,7 +342,7 @@ class StepStress:
         Raises:
             MPMError: The material's update fails, or F is singular.
         """
-        points = self._points
+        points = self.points
         try:
             points.update()
         except BaseException:
@@ -376,7 +356,7 @@ class StepStress:
     def _of_step(self, end: _Evaluation) -> _Evaluation:
         """Return the stress over the step by that at its end."""
         begin, part, factor = self._begin, self._part, 1.0 / self._share
-        gradients = Gradients(_gradient(self._points), begin.gradient)
+        gradients = Gradients(_gradient(self.points), begin.gradient)
         if part is not None:
             p, volume = part.pressure, part.volume(gradients.end)
             own = end.stress - p[:, None, None] * volume.slope
@@ -403,19 +383,19 @@ class StepStress:
         """Return the discrete gradient over the step (collective with F-bar)."""
         begin, potentials, factor = self._begin, None, 1.0 / self._share
         if begin.potential is not None and (self._kind >= 2).any():
-            potential = potential_energy(self._points, trial=True)
+            potential = potential_energy(self.points, trial=True)
             if self._part is not None:
                 potential = potential - self._part.stored(self._part.pressure)
             potentials = potential, begin.potential
         ends = Ends(end.stress, begin.stress, end.tangent, potentials, self._kind)
-        if (averaging := self._points.averaging) is None:
+        if (averaging := self.points.averaging) is None:
             return _Evaluation(*mean(ends, gradients, factor))
         stress, tangent, low_rank = mean_of_groups(averaging, ends, gradients, factor)
         return _Evaluation(stress, tangent, low_rank=low_rank)
 
     def initial_modulus(self) -> Array:
         """Return :meth:`MaterialPoints.initial_modulus` (collective)."""
-        return self._points.initial_modulus()
+        return self.points.initial_modulus()
 
     def commit(self) -> Callable[[], None]:
         """Make the last update the history, and take note of the work done in the step.
@@ -423,7 +403,7 @@ class StepStress:
         Returns:
             A function that takes it back.
         """
-        points, found, before = self._points, self._found, (self._begin, self._found, self._works)
+        points, found, before = self.points, self._found, (self._begin, self._found, self._works)
         H = _gradient(points) - self._begin.gradient
         viscous: Array | float = 0.0 if found.viscous is None else found.viscous
         whole: Array | float = 0.0
@@ -434,7 +414,7 @@ class StepStress:
             stress = _between(self._share, self._begin.stress, found.own) + whole
         else:
             stress = _between(self._share, self._begin.stress, points.first_piola)
-        weights = points.weights.ravel()
+        weights = points.strain.weights.ravel()
         works = (
             float(weights @ np.einsum("niJ,niJ->n", np.broadcast_to(one, H.shape), H))
             for one in (stress, whole, viscous)
@@ -451,7 +431,7 @@ class StepStress:
 
     def roll_back(self) -> None:
         """Return to the stress of the last converged step."""
-        points = self._points
+        points = self.points
         points.roll_back()
         self.settle()
         stress, own = points.first_piola, self._found.own
@@ -478,7 +458,7 @@ class StepStress:
 
     def strain_energy(self) -> float:
         """Return this rank's elastic energy, last converged; perhaps not a number (collective)."""
-        weights, energy = self._points.weights.ravel(), elastic_energy(self._points)
+        weights, energy = self.strain.weights.ravel(), elastic_energy(self.points)
         present = weights > 0.0
         return float(weights[present] @ energy[present])
 

@@ -50,8 +50,9 @@ class Strain:
         """Return the undeformed volume of each point, shape ``(n, nq)``."""
         return self.particles.undeformed.point_volumes()
 
-    def present_volumes(self) -> Array:
-        """Return the undeformed volume of each point, 0 where deleted, shape ``(n, nq)``."""
+    @property
+    def weights(self) -> Array:
+        """Undeformed volume of each point, shape ``(n, nq)``; 0 where deleted."""
         volumes = self.volumes()
         if self.particles.deletion is None:
             return volumes

@@ -153,8 +153,10 @@ class Behind:
         change = np.einsum("fqi,fqpJ,fpiJkL->fqpkL", along, M, A[:, :, :gdim, :gdim], optimize=True)
         gradients = self.surface.particles.undeformed.rule.gradients[cells]
         slopes = np.einsum("fqpkL,fpaL->fqak", change[..., :gdim, :gdim], gradients, optimize=True)
-        if stress.hoop is not None:
-            slopes[..., 0] += np.einsum("fqp,fpa->fqa", change[..., 2, 2], stress.hoop[cells])
+        if stress.strain.hoop is not None:
+            slopes[..., 0] += np.einsum(
+                "fqp,fpa->fqa", change[..., 2, 2], stress.strain.hoop[cells]
+            )
         return np.asarray(slopes[facet, at.places].reshape(len(facet), slopes.shape[2] * gdim))
 
     def through_groups(self, averaging: VolumeAveraging, at: At) -> tuple[Array, Array]:

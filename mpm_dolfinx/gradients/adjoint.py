@@ -293,7 +293,9 @@ class Adjoint:
         for points in problem.points:
             gdim = points.strain.particles.mesh.geometry.dim
             C = undeformed_tangent(points.laws)[:, :gdim, :gdim, :gdim, :gdim]
-            tangents.append(points.weights.ravel()[:, None, None] * np.einsum("niJiJ->niJ", C))
+            tangents.append(
+                points.strain.weights.ravel()[:, None, None] * np.einsum("niJiJ->niJ", C)
+            )
         return _First(
             [[varying(s) for s in points.last.states] for points in problem.points],
             [
@@ -391,7 +393,7 @@ class Adjoint:
         """Add what the laws of a body depend on, and take weights to the step's beginning."""
         points, body = self.problem.points[place], self.problem.bodies[place]
         seen, resists = law.seen(motion)
-        work = points.weights.ravel()[:, None, None] * seen
+        work = points.strain.weights.ravel()[:, None, None] * seen
         states = weights.states[place]
         pulled = law.pull(states, work)
         for one, first in zip(self._many, self._first, strict=True):
@@ -400,7 +402,7 @@ class Adjoint:
             one.add_of_points(body, law.by_parameter(one.parameter, states, work, pulled))
             modulus = first.modulus[place]
             if modulus is not None:
-                one.add_of_cells(body, -modulus * (points.weights * resists).sum(axis=1))
+                one.add_of_cells(body, -modulus * (points.strain.weights * resists).sum(axis=1))
         if any(law.have_history()):
             weights.states[place] = law.by_states(states, work, pulled)
         else:

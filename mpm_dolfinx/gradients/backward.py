@@ -188,7 +188,7 @@ class Backward:
         ):
             slope, tangent = law.by_gradient(own)
             tangents.append(tangent)
-            size = points.weights.ravel()[:, None, None]
+            size = points.strain.weights.ravel()[:, None, None]
             stress = law.effective(np.divide(slope, size, where=size > 0.0, out=0.0 * slope))
             _add_to(motion, term.forms.force_of(stress))
         with ExitStack() as blocks:

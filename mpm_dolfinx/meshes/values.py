@@ -108,7 +108,7 @@ def _numbers(value: Any, name: str, shape: tuple[int, ...]) -> Array:
 
 
 def _of_coordinates(function: Any, x: Array, name: str, shape: tuple[int, ...]) -> Array:
-    """Return what a function of coordinates ``(3, n)`` returns, shape ``(*shape, n)``."""
+    """Call a function of coordinates ``(3, n)``; return its values, ``(*shape, n)``."""
     n = x.shape[1]
     try:
         values = function(x)

@@ -81,7 +81,7 @@ class Unknown(Protocol):
         """Return its values at the points, shape ``(n, nq, ...)``."""
 
     def from_nodes(self) -> fem.Function | None:
-        """Return what has its values all over the domains; ``None`` if only points have them."""
+        """Return the Function all over the domains; ``None`` if only points have values."""
 
 
 class MaterialDomains(Domains):

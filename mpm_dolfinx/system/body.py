@@ -251,7 +251,7 @@ class BodyTerm(Term):
             plane = (slice(particles.mesh.geometry.dim),) * 4
             with agree(particles.mesh.comm):
                 tangent = undeformed_tangent(self._points.laws)[:, *plane]
-            energy = np.einsum("n,niJiJ->iJ", self._points.weights.ravel(), tangent)
+            energy = np.einsum("n,niJiJ->iJ", self._points.strain.weights.ravel(), tangent)
         own = [particles.initial_volume.sum(), *energy.ravel()]
         volume, *energies = particles.mesh.comm.allreduce(np.array(own))
         positive = [float(energy / volume) for energy in energies if energy > 0.0]

@@ -151,7 +151,7 @@ def _sizes(
     elastic = s / (2.0 * shear.reshape(s.shape))
     flows = points.last.plastic_strain() > 0.0
     densities = np.array([3.0 * np.abs(p * v) + s * e, s * e, flows * s * (e - elastic)])
-    return np.asarray((points.weights * densities)[:, ~body.deleted].sum(axis=(1, 2)))
+    return np.asarray((points.strain.weights * densities)[:, ~body.deleted].sum(axis=(1, 2)))
 
 
 def _parts(tensor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

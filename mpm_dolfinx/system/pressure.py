@@ -56,7 +56,7 @@ class PressureTerm(FieldTerm):
     def residuals(self) -> Sequence[PETSc.Vec]:
         found = self._material.volume_strain
         p = self._pressure.displacement.x.array[: len(found.volume)]
-        weights = self._material.weights.ravel()
+        weights = self._material.strain.weights.ravel()
         gap = np.where(weights > 0.0, found.volume - found.compliance * p, 0.0)
         self._force.array_w[:] = weights * gap
         return [self._none, self._force]
@@ -69,13 +69,13 @@ class PressureTerm(FieldTerm):
 
     def by_nodes(self, slope: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return volumes times strains of the nodes by a slope, ``(n, nq, k, gdim)``."""
-        weights = self._material.weights
+        weights = self._material.strain.weights
         n, nq = weights.shape
         gradients = self._particles.undeformed.rule.gradients
         gdim = gradients.shape[-1]
         slope = slope.reshape(n, nq, *slope.shape[1:])
         strains = gradients @ slope[:, :, :gdim, :gdim].swapaxes(2, 3)
-        hoop = self._material.hoop
+        hoop = self._material.strain.hoop
         if hoop is not None:
             strains[:, :, :, 0] += slope[:, :, 2, 2, None] * hoop
         strains *= np.where(weights > 0.0, weights, 0.0)[:, :, None, None]
@@ -86,7 +86,7 @@ class PressureTerm(FieldTerm):
     @override
     def stiffness_force(self, motions: Sequence[PETSc.Vec]) -> Sequence[PETSc.Vec]:
         moved, pressed = motions
-        found, weights = self._material.volume_strain, self._material.weights
+        found, weights = self._material.volume_strain, self._material.strain.weights
         nodes, x = self._particles.domain_nodes, self._nodal.x
         values = x.array.reshape(-1, self._particles.mesh.geometry.dim)
         x.array[: moved.getLocalSize()] = moved.array_r

@@ -72,7 +72,7 @@ class PressureSmoothing(FieldTerm):
 
     def _made(self, basis: PointBasis) -> PETSc.Mat:
         """Return the tangent at points in background cells (collective)."""
-        comm, volumes = self._pressure.mesh.comm, self._material.weights.ravel()
+        comm, volumes = self._pressure.mesh.comm, self._material.strain.weights.ravel()
         shear = undeformed_tangent(self._material.laws)[:, 0, 1, 0, 1]
         topology = self._pressure.V.mesh.topology
         cells = topology.index_map(topology.dim)

@@ -17,6 +17,7 @@ from ..assembly.blocks import Coupling
 from ..assembly.body_forms import BodyForms
 from ..constitutive.averaging import VolumeAveraging
 from ..constitutive.pressure import MeanStress
+from ..constitutive.strain import Strain
 from ..errors import MPMError
 from ..io.snapshot import Kept
 from ..parallel.boundary import Hooked, by_itself
@@ -46,8 +47,8 @@ class PointMaterial(Protocol):
         """Its derivative by F, ``(n nq, dim, dim, dim, dim)``; with F-bar the pointwise part."""
 
     @property
-    def hoop(self) -> NDArray[np.float64] | None:
-        """Hoop strains of a body of revolution's nodes, shape ``(n, nq, k)``, or ``None``."""
+    def strain(self) -> Strain:
+        """Strain of the points."""
 
     @property
     def averaging(self) -> VolumeAveraging | None:

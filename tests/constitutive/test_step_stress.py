@@ -192,7 +192,9 @@ def test_the_work_of_metal_is_its_energy_and_what_yielding_takes(cell):
         stress.commit()
         change = points.last.plastic_strain().ravel() - kappa
         middle = rho_y + np.sqrt(2.0 / 3.0) * hardening * (kappa + 0.5 * change)
-        taken = WORLD.allreduce(float(points.weights.ravel() @ (np.sqrt(1.5) * middle * change)))
+        taken = WORLD.allreduce(
+            float(points.strain.weights.ravel() @ (np.sqrt(1.5) * middle * change))
+        )
         found = WORLD.allreduce(stress.stress_work)
         energy = WORLD.allreduce(stress.strain_energy()) - energy
         assert found == pytest.approx(energy + taken, rel=1e-9)
@@ -275,7 +277,7 @@ def test_what_falls_apart_gives_back_no_more_than_it_has(f_bar):
     put(0.0, 0.0, 0.3 * x)
     stress.update()
     change = points.strain.gradient().reshape(mean.shape) - gradient
-    weights = points.weights.ravel()
+    weights = points.strain.weights.ravel()
     given = WORLD.allreduce(-float(weights @ np.einsum("niJ,niJ->n", mean, change)))
     stress.commit()
     assert WORLD.allreduce(stress.strain_energy()) < 1e-12 * first

@@ -90,7 +90,7 @@ def test_an_impact_on_metal_takes_what_yielding_takes(strength):
     # neither where metal yields nor where it is struck too softly for that.
     law = VonMises(YOUNG, POISSON, yield_stress=strength, hardening=10.0)
     problem, ball = thrown("box", law=law)
-    volumes, whole, taken = problem.points[0].weights.ravel(), ball.kinetic_energy, 0.0
+    volumes, whole, taken = problem.points[0].strain.weights.ravel(), ball.kinetic_energy, 0.0
     for _ in problem.steps(time=0.28, dt=0.02):
         kappa = problem.points[0].last.plastic_strain().ravel()
         taken = WORLD.allreduce(float(volumes @ ((strength + 5.0 * kappa) * kappa)))

@@ -82,15 +82,15 @@ def bar(cells, law="von mises", degree=1, free=False, length=LENGTH, mixed=None,
 def shear(problem):
     """Mean shear stress."""
     (points,) = problem.points
-    stress = (points.last.cauchy_stress()[:, :, 0, 1] * points.weights).sum()
-    return comm.allreduce(stress) / comm.allreduce(points.weights.sum())
+    stress = (points.last.cauchy_stress()[:, :, 0, 1] * points.strain.weights).sum()
+    return comm.allreduce(stress) / comm.allreduce(points.strain.weights.sum())
 
 
 def width(problem):
     """Width of the band by its second moment."""
     (points,) = problem.points
     x = problem.bodies[0].placement.points()[:, :, 0]
-    rate = points.last.plastic_strain() * points.weights
+    rate = points.last.plastic_strain() * points.strain.weights
     moments = [comm.allreduce((rate * (x - 0.5 * SPAN) ** k).sum()) for k in (0, 1, 2)]
     return np.sqrt(12.0 * (moments[2] / moments[0] - (moments[1] / moments[0]) ** 2))
 

@@ -381,7 +381,7 @@ def at_points(problem):
     strain = np.einsum("nqik,nqk,nqjk->nqij", axes, 0.5 * np.log(squares), axes)
     stress = points.last.gained_stress(F)
     places = np.einsum("qk,nki->nqi", body.undeformed.rule.shapes, body.initial_domains)
-    weights = points.weights.reshape(-1, 1, 1)
+    weights = points.strain.weights.reshape(-1, 1, 1)
     return places.reshape(-1, 2), weights, *(v.reshape(-1, 3, 3) for v in (stress, strain))
 
 

@@ -74,7 +74,7 @@ def test_damage_of_a_uniform_bar_is_the_closed_form(law, split, dim, model):
     np.testing.assert_allclose(damage.field.x.array, expected, atol=1e-5)
     # What was put in is stored or has gone into cracks.
     points = problem.points[0]
-    stored = WORLD.allreduce(float((elastic_energy(points) * points.weights.ravel()).sum()))
+    stored = WORLD.allreduce(float((elastic_energy(points) * points.strain.weights.ravel()).sum()))
     surface = damage.surface_energy()
     own = expected if model == "AT1" else expected**2
     weight = 8 / 3 if model == "AT1" else 2.0

@@ -30,7 +30,7 @@ def test_forces_are_those_of_deviations_from_the_means_of_cells():
     tangent[:, 0, 1, 0, 1] = shear
     law = SimpleNamespace(points=slice(None), undeformed_tangent=lambda: tangent)
     laws = SimpleNamespace(num_points=len(at), dim=2, governed=[law])
-    material = SimpleNamespace(weights=volumes[:, None], laws=laws)
+    material = SimpleNamespace(strain=SimpleNamespace(weights=volumes[:, None]), laws=laws)
     field.x.array[: len(at)] = np.sin(5.0 * at[:, 0]) + at[:, 1] ** 2
     carried = CarriedField(field)
     carried.locate()
