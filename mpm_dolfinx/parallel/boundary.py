@@ -14,6 +14,7 @@ import functools
 import inspect
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from types import CodeType
 from typing import Any, cast
 
 from mpi4py import MPI
@@ -264,9 +265,16 @@ def _is_free(cls: type, name: str) -> bool:
 
 def _calls(written: Any, name: str) -> bool:
     """Return whether what stands in the place of a method calls it, as far as its code tells."""
-    function = getattr(written, "fget", None) or getattr(written, "__func__", written)
-    code = getattr(inspect.unwrap(function), "__code__", None)
-    return code is not None and name in code.co_names
+    parts = (getattr(written, part, None) for part in ("fget", "func", "__func__"))
+    function = next((part for part in parts if part is not None), written)
+    return name in _named_in(getattr(inspect.unwrap(function), "__code__", None))
+
+
+def _named_in(code: Any) -> set[str]:
+    """Return the names of what code calls or reads, and what is defined in it."""
+    if not isinstance(code, CodeType):
+        return set()
+    return set(code.co_names).union(*map(_named_in, code.co_consts))
 
 
 def _same_truth(function: Callable[[Any], Any], name: str) -> Callable[[Any], Any]:

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """A user's code that fails on one rank, and arguments that are wrong there: found by reflection."""
 
+import functools
 import inspect
 import traceback
 
@@ -169,6 +170,24 @@ def extending(base, name):
         made,
     )
     return made["Own"]
+
+
+def test_what_calls_in_other_ways_is_allowed():
+    class Watched(mpm.QuasiStaticProblem):
+        @functools.cached_property
+        def yield_function(self):
+            return super().yield_function
+
+        @functools.cache
+        def solve(self, *args, **given):
+            return min((super(Watched, self).solve(*args, **given) for _ in range(1)), key=id)
+
+        def laws(self):
+            return mpm.QuasiStaticProblem.laws(self)
+
+    problem = made(Watched)
+    assert problem.solve(2).load == [0.5, 1.0]
+    assert len(problem.yield_function) == problem.bodies[0].num_local
 
 
 def test_what_a_class_of_a_user_stands_for_is_told():
