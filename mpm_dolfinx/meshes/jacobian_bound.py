@@ -15,7 +15,7 @@ import basix
 
 from ..tolerances import NEGLIGIBLE
 
-__all__ = ["JacobianBound"]
+__all__ = ["JacobianBound", "jacobians"]
 
 #: Halvings of a domain after which a Jacobian that may vanish counts as vanishing.
 HALVINGS = 4
@@ -66,9 +66,7 @@ class JacobianBound:
 
     def coefficients(self, nodes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the Bernstein coefficients of the determinants of cells ``(n, k, gdim)``."""
-        gdim, points, k = self._slopes.shape
-        columns = np.matmul(self._slopes.reshape(-1, k), nodes).reshape(-1, gdim, points, gdim)
-        return np.asarray(_determinants(columns) @ self._to_bernstein.T)
+        return np.asarray(jacobians(self._slopes, nodes) @ self._to_bernstein.T)
 
     def lower_bound(
         self, nodes: NDArray[np.float64], sign: NDArray[np.float64]
@@ -140,8 +138,15 @@ class JacobianBound:
         return sign, size, result
 
 
-def _determinants(columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return determinants ``(n, points)`` of columns ``(n, gdim, points, gdim)``."""
+def jacobians(slopes: NDArray[np.float64], nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return det dx/dxi of cells at points, shape ``(n, points)``.
+
+    Args:
+        slopes: Derivatives of their shape functions there, shape ``(gdim, points, k)``.
+        nodes: The cells, shape ``(n, k, gdim)``.
+    """
+    gdim, points, k = slopes.shape
+    columns = np.matmul(slopes.reshape(-1, k), nodes).reshape(-1, gdim, points, gdim)
     a, b, c = columns[:, 0], columns[:, 1], columns[:, -1]
     if columns.shape[1] == 2:
         return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

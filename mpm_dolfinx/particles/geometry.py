@@ -15,7 +15,7 @@ from dolfinx import fem, mesh
 
 from ..errors import DomainDistortionError, agree
 from ..meshes.cells import equispaced_element, input_cell_index
-from ..meshes.jacobian_bound import JacobianBound
+from ..meshes.jacobian_bound import JacobianBound, jacobians
 from ..meshes.order import vtk_cell
 from ..meshes.quadrature import (
     DomainQuadrature,
@@ -193,7 +193,7 @@ class Geometry:
             points: Shape ``(nq, tdim)``.
             domains: Nodes of the owned domains, shape ``(n, k, gdim)``.
         """
-        return _determinants(self._slopes(points), domains)
+        return jacobians(self._slopes(points), domains)
 
     def _slopes(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return derivatives of the shape functions at reference points, ``(tdim, nq, k)``."""
@@ -210,7 +210,7 @@ class Geometry:
         Args:
             domains: Nodes of the owned domains, shape ``(n, k, gdim)``.
         """
-        return self.orientation[:, None] * _determinants(self._corner_slopes, domains)
+        return self.orientation[:, None] * jacobians(self._corner_slopes, domains)
 
     def quality(self, domains: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the mean ratio of the deformation of domains at their worst corner, ``(n,)``.
@@ -228,8 +228,3 @@ class Geometry:
         volume = np.maximum(np.linalg.det(F), 0.0)
         ratio = self.gdim * volume ** (2.0 / self.gdim) / (F**2).sum(axis=(2, 3))
         return np.asarray(ratio.min(axis=1, initial=1.0))
-
-
-def _determinants(slopes: NDArray[np.float64], domains: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return det dx/dxi of domains by derivatives of their shape functions, shape ``(n, nq)``."""
-    return np.asarray(np.linalg.det(np.einsum("jqk,nki->nqij", slopes, domains)))
