@@ -307,7 +307,9 @@ class ProblemState:
         try:
             change()
             problem.build()
-            self.adopt(carry(snapshot))
+            known, run = self._stepper.trial.run, self.adopt(carry(snapshot))
+            if known is not None and run is not None:
+                known.base = run.base  # (on W where nodes are free, which is another one now)
         except BaseException:
             if undo is not None:
                 undo()

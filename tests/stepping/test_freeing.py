@@ -223,6 +223,17 @@ def test_a_step_that_fails_leaves_free_nodes_as_they_were(how):
     np.testing.assert_allclose(*ends, rtol=0.0, atol=1e-12)
 
 
+def test_particles_go_to_other_ranks_within_a_run():
+    ends = []
+    for threshold in (None, 0.0):
+        problem, own = column(n=2, weight=6e3)
+        problem.solve(8, repartition=threshold)
+        ends.append((scenes.in_order(own, own.centroid), share_free(own)))
+    (one, share), (two, its) = ends
+    assert share == its
+    np.testing.assert_allclose(one, two, rtol=0.0, atol=1e-8)
+
+
 def test_bodies_that_would_pass_through_each_other_are_refused():
     """Those on one background, of which the nodes of one are free and nothing couples them."""
 
