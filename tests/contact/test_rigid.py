@@ -431,7 +431,7 @@ def test_a_body_that_nothing_holds_yet_is_no_false_verdict():
             "Coulomb.stiffness must be a positive number",
         ),
         ({"facets": 3}, r"facets= of a Rigid must be tags and one of them"),
-        ({"facets": (None, 3)}, "A Rigid needs facet_tags="),
+        ({"facets": (None, 3)}, "A tag of a Rigid needs facet_tags="),
     ],
 )
 def test_what_makes_no_sense_is_refused(options, sentence):

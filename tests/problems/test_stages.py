@@ -316,7 +316,7 @@ def test_what_cannot_be_leaves_all_as_it_was():
         problem.remove()
     with pytest.raises(mpm.MPMError, match=r"remove\(\) needs cell_tags="):
         problem.remove(tags=1)
-    with pytest.raises(mpm.MPMError, match="Nothing is to be"):
+    with pytest.raises(mpm.MPMError, match="No particle is to be removed"):
         problem.remove([])
     with pytest.raises(mpm.MPMError, match="given twice"):
         problem.add(mpm.Body(body, problem.setup.bodies[0].material))
