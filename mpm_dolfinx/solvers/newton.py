@@ -204,8 +204,7 @@ class NewtonSolver:
         self._factor.begin(sizes[1], problem.levels)
         if sizes[1] == 0:
             problem.impose()
-        if (failure := now.residual.at(x)) is not None:
-            raise failure
+        now.residual.begin(x)
         predicts = not again and self._predictions.lead
         if sizes[1] > 0:
             self._solve_from(x, predicts)

@@ -49,13 +49,34 @@ class Residual:
         self.failure: MPMError | None = None
         self.centre: PETSc.Vec | None = None
 
-    def at(self, x: PETSc.Vec) -> MPMError | None:
-        """Evaluate both at unknowns, or say why that cannot be."""
+    def begin(self, x: PETSc.Vec) -> None:
+        """Evaluate both before anything moves.
+
+        Args:
+            x: Zeros.
+
+        Raises:
+            MPMError: Why that cannot be. Forces that are not finite here are in no shorter step.
+        """
+        given = MPMError(
+            "The forces are not finite before anything moves; look at the values of loads, and of "
+            "Functions and Constants in forms and terms"
+        )
+        if (failure := self.at(x, given)) is not None:
+            raise failure
+
+    def at(self, x: PETSc.Vec, infinite: MPMError | None = None) -> MPMError | None:
+        """Evaluate both at unknowns, or say why that cannot be.
+
+        Args:
+            x: The unknowns.
+            infinite: What to say where the residual is not finite.
+        """
         self._statistics.count("residuals")
         if np.isfinite(norm(x)):
             failure = self._problem.residual(x, self.F)
             if failure is None and not np.isfinite(norm(self.F)):
-                failure = ConvergenceError("The residual is not finite")
+                failure = infinite or ConvergenceError("The residual is not finite")
         else:
             failure = ConvergenceError("The linear solve broke down on a singular matrix")
         self.failure = failure

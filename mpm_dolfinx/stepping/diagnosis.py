@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ..constitutive.points import MaterialPoints
 from ..errors import TRIAL_ERRORS, ConvergenceError, DomainDistortionError, MPMError, agreed
 from ..history import Statistics
+from ..parallel.magnitudes import norm
 from ..parallel.totals import over_ranks
 from ..particles.domains import crossed
 from ..particles.particles import Particles
@@ -86,7 +87,8 @@ def placed(
         advice = f"; {limit}"
     particles, text = error.particles, error.message.rstrip(".")
     dofs: list[int] = []
-    if isinstance(error, ConvergenceError) and not particles:
+    lost = any([not np.isfinite(norm(field.force)) for field in reduced.fields])
+    if (lost or isinstance(error, ConvergenceError)) and not particles:
         particles = _worst_particles(reduced)
         dofs, where, space = _worst_dof(reduced)
         if particles and dofs:
@@ -182,7 +184,7 @@ def _worst_of(field: Field) -> tuple[float, int, tuple[float, ...]]:
     if field.free is None or len(field.dofs) == 0:
         return -1.0, -1, ()
     V, gdim = field.V, field.V.mesh.geometry.dim
-    size = np.nan_to_num(np.abs(field.force.array_r[field.dofs]), nan=0.0, posinf=0.0)
+    size = np.nan_to_num(np.abs(field.force.array_r[field.dofs]), nan=np.inf)
     dof = int(field.dofs[size.argmax()])
     x = V.tabulate_dof_coordinates()[dof // V.dofmap.index_map_bs, :gdim]
     start = V.dofmap.index_map.local_range[0] * V.dofmap.index_map_bs
@@ -201,7 +203,7 @@ def _worst_particles(reduced: ReducedSystem) -> list[int]:
         comm: MPI.Comm = field.V.mesh.comm
         for motion in field.motions:
             body = motion.particles
-            size = np.nan_to_num(motion.nodal_size(residual), nan=0.0, posinf=0.0)
+            size = np.nan_to_num(motion.nodal_size(residual), nan=np.inf)
             largest = comm.allreduce(float(size.max(initial=0.0)), MPI.MAX)
             if largest <= best[0]:
                 continue

@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Where a step failed, and what is said of it."""
 
+import numpy as np
 import pytest
 import scenes
 from scenes import QUADRILATERAL
+
+from dolfinx import fem
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.stepping.diagnosis import improper
@@ -22,3 +25,23 @@ def test_quadrilaterals_that_cross_themselves_are_told_of_more_points(degree, to
     error = improper([particles], [])
     assert isinstance(error, mpm.DomainDistortionError) and error.particles
     assert ("quadrature_degree=2" in str(error)) is told
+
+
+@pytest.mark.parametrize("later", [False, True])
+def test_loads_that_are_not_finite_are_no_limit_of_the_ground(later):
+    """They are told at once, without cutbacks, and the step before is whole."""
+    V = scenes.vectors(scenes.box([-1.0, 0.0], [2.0, 2.0], [6, 4], QUADRILATERAL))
+    body = scenes.unit(2, QUADRILATERAL)
+    force = fem.Constant(body, (0.0, -1.0 if later else np.nan))
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(mpm.Particles(body, V), mpm.materials.Hencky(100.0, 0.3), body_force=force),
+        bcs=[mpm.held(V, y=0.0)],
+    )
+    if later:
+        problem.solve(steps=1)
+        force.value[0] = np.inf
+    before = problem.bodies[0].displacement.x.array.copy()
+    with pytest.raises(mpm.MPMError, match="not finite before anything moves") as error:
+        problem.step() if later else problem.solve(steps=1)
+    assert "limit" not in str(error.value) and problem.history.cutbacks == 0
+    assert np.array_equal(problem.bodies[0].displacement.x.array, before)

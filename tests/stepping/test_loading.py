@@ -22,7 +22,7 @@ from mpm_dolfinx.stepping.control import StepControl
 def test_load_that_is_not_a_number():
     failed = scenes.block()
     failed.particles.load.value = np.nan
-    raises(failed.step, mpm.ConvergenceError, r"finite")
+    raises(failed.step, mpm.MPMError, r"finite")
     assert float(failed.particles.load.value) == 0.0
     failed.solve(steps=1)
 
