@@ -18,7 +18,7 @@ from ..errors import MPMError
 from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
 from .petsc import MatrixSum, assemble_into, assemble_matrix, create_vector
-from .rules import depends_on, form_of_rank, split_by_rule
+from .rules import depends_on, parts_with
 
 __all__ = ["BackgroundForms"]
 
@@ -33,9 +33,8 @@ class BackgroundForms:
     """
 
     def __init__(self, F: ufl.Form, particles: Particles, **options: Any) -> None:
-        form_of_rank(F, 1, particles.V, "the background form", "the background space V")
-        u = particles.increment
-        parts = split_by_rule(F, u)
+        u, where = particles.increment, "the background space V"
+        parts = parts_with(particles.V, F, 1, "the background form", where, u)
         tangents = [ufl.derivative(p, u) for p in parts if depends_on(p, u)]
         if not tangents:
             raise MPMError("The background form does not depend on particles.increment.")

@@ -28,7 +28,7 @@ from ..particles.particles import Particles
 from ..tolerances import BLOCK
 from .low_rank import LowRankTangent
 from .petsc import assemble_into, assemble_matrix, create_vector, load_quotient
-from .rules import couples_cells, depends_on, follows, form_of_rank, is_zero, split_by_rule
+from .rules import couples_cells, depends_on, follows, parts_with
 from .volume_ratio import average_in
 
 __all__ = ["BodyForms", "PointStress", "integrals_of", "no_values"]
@@ -109,23 +109,20 @@ class BodyForms:
         self.internal = internal
         self.factor = 1.0
         d = particles.displacement
-        parts: list[ufl.Form] = []
+        W, where, zero = particles.W, "particles.W", internal is not None
         self._average = average_in(R)
-        if R is not None and (internal is None or not is_zero(R)):
-            (self._test,) = form_of_rank(R, 1, particles.W, "the residual R", "particles.W")
-            parts = split_by_rule(R, d, *others)
+        parts: list[ufl.Form] = []
+        if R is not None:
+            parts = parts_with(W, R, 1, "the residual R", where, d, *others, zero=zero)
         if particles.deletion is not None:
             parts = [particles.deletion.present_only(part) for part in parts]
         live = [p for p in parts if follows(p, d, *others)]
         dead = [p for p in parts if not follows(p, d, *others)]
-        tangents: list[ufl.Form]
-        if J is None or (internal is not None and is_zero(J)):
+        tangents = [] if J is None else parts_with(W, J, 2, "the tangent J", where, d, zero=zero)
+        if not tangents:
             tangents = [ufl.derivative(p, d) for p in live if depends_on(p, d)]
-        else:
-            form_of_rank(J, 2, particles.W, "the tangent J", "particles.W")
-            tangents = split_by_rule(J, d)
-            if particles.deletion is not None:
-                tangents = [particles.deletion.present_only(part) for part in tangents]
+        elif particles.deletion is not None:
+            tangents = [particles.deletion.present_only(part) for part in tangents]
         if not tangents and internal is None:
             raise MPMError(
                 "The residual R does not depend on particles.displacement; write it in that "
@@ -269,7 +266,7 @@ class BodyForms:
             virtual, forms = fem.Function(self._particles.W), []
             for part in self._parts:
                 if any(each is function for each in part.coefficients()):
-                    work = ufl.replace(part, {self._test: virtual})
+                    work = ufl.replace(part, {part.arguments()[0]: virtual})
                     forms.append(ufl.derivative(work, function))
             self._works[key] = virtual, self._compile(forms), function
         virtual, compiled, _ = self._works[key]
@@ -389,9 +386,9 @@ class BodyForms:
             self._body,
             ("Discontinuous Lagrange", self._element.degree, (self._element.block_size,)),
         )
-        swap = {self._test: ufl.TestFunction(broken)}
-        forms = self._compile([ufl.replace(part, swap) for part in self._parts])
-        return forms, broken
+        test = ufl.TestFunction(broken)
+        tested = [ufl.replace(part, {part.arguments()[0]: test}) for part in self._parts]
+        return self._compile(tested), broken
 
     def absolute_contributions(self, domain_nodes: NDArray[np.int32]) -> PETSc.Vec:
         """Return the sum over domains of the absolute values of what each adds to the residual.

@@ -9,21 +9,18 @@ from functools import singledispatchmethod
 from typing import Any
 
 from ufl.algorithms import expand_derivatives
-from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
-from ufl.algorithms.strip_terminal_data import strip_terminal_data
 
 __all__ = ["expanded"]
 
 
-def expanded(integral: Any) -> Any:
-    """Return an integrand with its derivatives carried out.
+def expanded(form: Any) -> Any:
+    """Return a form or an integrand with its derivatives carried out.
 
     UFL's traversals dispatch by ``functools.singledispatchmethod``, which with Python 3.13 keeps
-    for ever what it was used for: all of the form, down to meshes and their communicators. So the
-    integrand is that of an integral without data, and what was kept is dropped.
+    for ever what it was used for: all of the form, down to meshes and their communicators. So what
+    was kept is dropped.
     """
-    stripped, _ = strip_terminal_data(integral)
-    result = expand_derivatives(apply_algebra_lowering(stripped.integrand()))
+    result = expand_derivatives(form)
     for traversal in _traversals():
         for method in vars(traversal).values():
             kept = getattr(method, "_method_cache", None)

@@ -14,14 +14,14 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx.fem import petsc as fem_petsc
-from ufl.algorithms import expand_derivatives
 
 from ..errors import MPMError
 from ..parallel.compilation import compiled_form
 from ..particles.field import ParticleField
 from ..particles.particles import Particles
+from .expansion import expanded
 from .petsc import assemble_into, assemble_matrix, create_vector, load_quotient
-from .rules import couples_cells, follows, form_of_rank, is_zero, split_by_rule
+from .rules import couples_cells, follows, parts_with, split_by_rule
 
 __all__ = ["FieldForms"]
 
@@ -57,11 +57,11 @@ class FieldForms:
     ) -> None:
         self._options, self._particles, self._fields = options, particles, list(fields)
         unknowns = [particles.displacement, *fields]
-        parts = [[] if R is None else self._split(R, unknowns)]
+        parts = [[] if R is None else self._present(split_by_rule(R, *unknowns))]
         for field, residual in zip(fields, residuals, strict=True):
-            named = f"the residual of '{field.name}'"
-            form_of_rank(residual, 1, field.W, named, "the field's W")
-            parts.append(self._split(residual, unknowns))
+            named, where = f"the residual of '{field.name}'", "the field's W"
+            own_parts = parts_with(field.W, residual, 1, named, where, *unknowns)
+            parts.append(self._present(own_parts))
         if any(couples_cells(part) for own in parts[1:] for part in own):
             raise MPMError("The residual of a field cannot be integrated over interior facets.")
         self._parts = parts[1:]
@@ -84,8 +84,7 @@ class FieldForms:
         self._matrices: dict[tuple[int, int], PETSc.Mat] = {}
         self._broken: list[tuple[list[fem.Form], PETSc.Vec] | None] = [None] * len(self._fields)
 
-    def _split(self, form: ufl.Form, unknowns: Sequence[fem.Function]) -> list[ufl.Form]:
-        parts = split_by_rule(form, *unknowns)
+    def _present(self, parts: list[ufl.Form]) -> list[ufl.Form]:
         deletion = self._particles.deletion
         return parts if deletion is None else [deletion.present_only(part) for part in parts]
 
@@ -102,8 +101,8 @@ class FieldForms:
                 if (i == 0 and j == 0) or (j == 0 and not moves):
                     continue
                 trial = ufl.TrialFunction(unknown.function_space)
-                forms = [expand_derivatives(ufl.derivative(part, unknown, trial)) for part in own]
-                forms = [form for form in forms if not form.empty() and not is_zero(form)]
+                forms = [expanded(ufl.derivative(part, unknown, trial)) for part in own]
+                forms = [form for form in forms if not form.empty()]
                 if forms:
                     found[i, j] = [compiled_form(form, **self._options) for form in forms]
         return found

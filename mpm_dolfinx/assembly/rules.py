@@ -12,7 +12,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from ufl.algorithms.estimate_degrees import estimate_total_polynomial_degree
-from ufl.classes import Division, Grad, Indexed, SpatialCoordinate
+from ufl.classes import Division, Grad, Indexed, SpatialCoordinate, Zero
 from ufl.corealg.traversal import traverse_unique_terminals, unique_pre_traversal
 
 from ..errors import MPMError
@@ -24,30 +24,48 @@ __all__ = [
     "data_at_points",
     "depends_on",
     "follows",
-    "form_of_rank",
-    "is_zero",
+    "parts_with",
     "split_by_rule",
-    "vanishes",
 ]
 
 
-def form_of_rank(form: Any, rank: int, space: fem.FunctionSpace, what: str, where: str) -> Any:
-    """Return test (and trial) function of a form, if they are from a space."""
-    if isinstance(form, ufl.Form) and is_zero(form):
+def parts_with(
+    space: fem.FunctionSpace,
+    form: Any,
+    rank: int,
+    what: str,
+    where: str,
+    *unknowns: fem.Function,
+    zero: bool = False,
+) -> list[ufl.Form]:
+    """Return the parts by rule of a form whose test (and trial) function are from a space.
+
+    Args:
+        space: The space.
+        form: The form.
+        rank: 1, or 2 with a trial function.
+        what: What messages call the form.
+        where: What messages call the space.
+        *unknowns: As of :func:`split_by_rule`.
+        zero: Whether the form may be zero, which has no parts.
+
+    Raises:
+        MPMError: Another form, or as :func:`split_by_rule`.
+    """
+    is_form = isinstance(form, ufl.Form)
+    parts = split_by_rule(form, *unknowns) if is_form else []
+    if is_form and not parts:
+        if zero:
+            return parts
         raise MPMError(f"{what} is zero.")
-    arguments = form.arguments() if isinstance(form, ufl.Form) else ()
+    arguments = form.arguments() if is_form else ()
     if len(arguments) != rank:
         kind = "one test function" if rank == 1 else "a test and a trial function"
         raise MPMError(f"{what} must be a UFL form with {kind} of {where}.")
     if any(argument.ufl_function_space() != space for argument in arguments):
         kind = "test function" if rank == 1 else "test and trial functions"
         raise MPMError(f"The {kind} of {what} must be from {where}.")
-    return arguments
-
-
-def is_zero(form: Any) -> bool:
-    """Return whether nothing is left of a form, as of ``0.0 * form``."""
-    return isinstance(form, ufl.Form) and all(map(vanishes, form.integrals()))
+    return parts
 
 
 def couples_cells(form: ufl.Form) -> bool:
@@ -74,13 +92,8 @@ def data_at_points(form: ufl.Form) -> set[fem.Function]:
     return {c for c in form.coefficients() if c.ufl_element().has_custom_quadrature}
 
 
-def vanishes(integral: Any) -> bool:
-    """Return whether an integral is zero, as in ``0.0 * form``: FFCx makes nothing of it."""
-    return isinstance(expanded(integral), ufl.constantvalue.Zero)
-
-
-def _rule(integral: Any) -> tuple[int, str]:
-    """Return the degree and scheme that one integral is meant to be integrated with."""
+def _rule(integral: Any, integrand: Any) -> tuple[int, str]:
+    """Return the degree and scheme that one integral, expanded, is meant to be integrated with."""
     metadata = integral.metadata()
     degree = metadata.get("quadrature_degree", -1)
     scheme = str(metadata.get("quadrature_rule", "default"))
@@ -106,16 +119,16 @@ def _rule(integral: Any) -> tuple[int, str]:
                 "particles.dx."
             )
     if at_points:
-        _require_no_gradient(integral)
+        _require_no_gradient(integrand)
     if degree == -1:
-        estimate = estimate_total_polynomial_degree(expanded(integral))
+        estimate = estimate_total_polynomial_degree(integrand)
         degree = max(estimate) if isinstance(estimate, tuple) else estimate
     return int(degree), scheme
 
 
-def _require_no_gradient(integral: Any) -> None:
+def _require_no_gradient(integrand: Any) -> None:
     """Raise an error where an integral has a gradient of what is known at points alone."""
-    for node in unique_pre_traversal(expanded(integral)):
+    for node in unique_pre_traversal(integrand):
         if not isinstance(node, Grad):
             continue
         inner = node.ufl_operands[0]
@@ -124,7 +137,7 @@ def _require_no_gradient(integral: Any) -> None:
         element: Any = inner.ufl_element()  # type: ignore[no-untyped-call]
         if getattr(element, "has_custom_quadrature", False):
             raise MPMError(
-                f"The form holds a gradient of {_name_of(inner, integral)}, which is known at "
+                f"The form holds a gradient of {_name_of(inner)}, which is known at "
                 "quadrature points alone; for gradients make a field with at='nodes'."
             )
 
@@ -155,19 +168,17 @@ def _require_radius_seen(integral: Any, degree: int, *unknowns: fem.Function) ->
             )
 
 
-def _name_of(terminal: Any, integral: Any) -> str:
-    """Return the name of a Function, or of an argument by its number in the integral."""
-    if isinstance(terminal, ufl.Argument):
-        return "a test or trial function"
-    known = traverse_unique_terminals(integral.integrand())
-    names = [f.name for f in known if isinstance(f, fem.Function) and f.count() == terminal.count()]
-    return f"'{names[0]}'" if names else "a Function"
+def _name_of(terminal: Any) -> str:
+    """Return the name of a Function, or what an argument is."""
+    return (
+        f"'{terminal.name}'" if isinstance(terminal, fem.Function) else "a test or trial function"
+    )
 
 
 def split_by_rule(form: ufl.Form, *unknowns: fem.Function) -> list[ufl.Form]:
     """Split a form so that each part has one rule, one kind of dependence and one set of tags.
 
-    Integrals that are zero are left out.
+    Integrals that are zero, as in ``0.0 * form``, are left out: FFCx makes nothing of them.
 
     FFCx (0.9 to 0.11) miscompiles a form that mixes a one-point rule with another rule, so
     each rule gets a form of its own; parts that are constant during a step are apart too.
@@ -186,9 +197,10 @@ def split_by_rule(form: ufl.Form, *unknowns: fem.Function) -> list[ufl.Form]:
     parts: dict[tuple[bool, str, int, str, int], list[Any]] = defaultdict(list)
     markers: list[Any] = []
     for integral in form.integrals():
-        if vanishes(integral):
+        integrand = expanded(integral.integrand())
+        if isinstance(integrand, Zero):
             continue
-        degree, scheme = _rule(integral)
+        degree, scheme = _rule(integral, integrand)
         _require_radius_seen(integral, degree, *unknowns)
         metadata = dict(integral.metadata())
         metadata.update(quadrature_degree=degree, quadrature_rule=scheme)

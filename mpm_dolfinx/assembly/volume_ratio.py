@@ -19,6 +19,7 @@ from ..errors import MPMError
 from ..meshes.quadrature import volume_ratio
 from ..parallel.compilation import compiled_form
 from ..particles.particles import Particles
+from .expansion import expanded
 from .rules import depends_on, split_by_rule
 
 __all__ = ["AveragedVolumeRatio", "average_in"]
@@ -127,7 +128,7 @@ class AveragedVolumeRatio(fem.Function):
         )
 
     def _compile(self, form: ufl.Form) -> list[fem.Form]:
-        form = ufl.algorithms.expand_derivatives(form)
+        form = expanded(form)
         return [compiled_form(part) for part in split_by_rule(form, self.particles.displacement)]
 
     def _of_domains(self, forms: list[fem.Form], shape: tuple[int, ...] = ()) -> Array:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import ufl
 from dolfinx import fem, la
 
+from ..assembly.expansion import expanded
 from ..assembly.rules import depends_on, split_by_rule
 from ..background.basis import BackgroundBasis
 from ..errors import MPMError, agree
@@ -178,9 +179,7 @@ class DisplacementControl:
             raise MPMError("functional must be a UFL form without test functions.")
         if not depends_on(functional, d):
             raise MPMError("functional does not depend on the displacement of the particles.")
-        slope = ufl.algorithms.expand_derivatives(
-            ufl.derivative(functional, d, ufl.TestFunction(particles.W))
-        )
+        slope = expanded(ufl.derivative(functional, d, ufl.TestFunction(particles.W)))
         if depends_on(slope, d):
             raise MPMError("functional must be linear in the displacement of the particles.")
         vector = la.vector(particles.W.dofmap.index_map, particles.W.dofmap.index_map_bs)
