@@ -136,7 +136,7 @@ def _ranks_of(value: Any, depth: int) -> MPI.Comm | None:
         return value
     if isinstance(value, list | tuple):
         found = (_ranks_of(entry, depth) for entry in value)
-    elif depth == 0 or isinstance(value, str | type):
+    elif value is None or depth == 0 or isinstance(value, str | type):
         return None
     else:
         found = (_ranks_of(getattr(value, name, None), depth - 1) for name in KNOWN_BY)

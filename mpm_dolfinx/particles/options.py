@@ -296,9 +296,10 @@ def _shapes(
     slack = 1e-10 * np.ptp(nodes, axis=1).max(axis=1, initial=0.0)
     bent = np.flatnonzero(np.abs(nodes - straight).max(axis=(1, 2), initial=0.0) > slack)
     sign, folded = np.where(volume < 0.0, -1.0, 1.0), np.zeros(len(nodes), dtype=bool)
-    bound = JacobianBound(cell, element)
-    for block in np.split(bent, range(BLOCK, len(bent), BLOCK)):
-        sign[block], volume[block], folded[block] = bound.folded(nodes[block])
+    if len(bent):
+        bound = JacobianBound(cell, element)
+        for block in np.split(bent, range(BLOCK, len(bent), BLOCK)):
+            sign[block], volume[block], folded[block] = bound.folded(nodes[block])
     return sign, volume, folded
 
 
