@@ -5,6 +5,7 @@
 import contextlib
 import fcntl
 import functools
+import importlib.util
 import json
 import os
 import subprocess
@@ -12,6 +13,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from importlib import metadata
+from importlib.machinery import EXTENSION_SUFFIXES
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +92,20 @@ def patient_compilers() -> Iterator[None]:
                 os.environ["XDG_CONFIG_HOME"] = before
 
 
+def loaded(module_name, object_names, cache_dir):
+    """Return what FFCx compiled under a name, and its module, or twice ``None``."""
+    path = Path(cache_dir, module_name + EXTENSION_SUFFIXES[0])
+    if not (Path(cache_dir, module_name + READY).exists() and path.exists()):
+        return None, None
+    spec = importlib.util.spec_from_file_location(module_name, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return [getattr(module.lib, name) for name in object_names], module
+
+
 @contextlib.contextmanager
 def remembered_forms() -> Iterator[None]:
-    """Have FFCx look for a form once, where it lists its whole cache for each that is made again.
+    """Have FFCx look for a form once and by its name: it lists its whole cache each time.
 
     And setuptools for what is installed once, where it looks seven times for each that is compiled.
     """
@@ -101,7 +114,9 @@ def remembered_forms() -> Iterator[None]:
     def remember(module_name, object_names, cache_dir, timeout):
         key = module_name, tuple(object_names), str(cache_dir)
         if key not in found:
-            objects, module = look(module_name, object_names, cache_dir, timeout)
+            objects, module = loaded(module_name, object_names, cache_dir)
+            if module is None:
+                objects, module = look(module_name, object_names, cache_dir, timeout)
             if module is None:  # which the caller compiles now
                 return None, None
             found[key] = objects, module
