@@ -33,12 +33,11 @@ from dolfinx import fem
 from ..errors import MPMError
 from ..materials.base import State
 from ..parallel.magnitudes import norm
-from ..particles.particles import Particles
 from ..problems.quasistatic import QuasiStaticProblem
 from ..solvers.newton import NewtonSolver
-from ..transfer.matrix import transfer_matrix
 from .laws import Laws
 from .nearby import add_product, varying, without_tangents
+from .slopes import Slopes
 
 __all__ = ["Backward", "Record", "Weights", "copied", "no_weights"]
 
@@ -211,12 +210,9 @@ class Backward:
             total = v.copy()
             y = backgrounds[place].duplicate()
             y.array_w[:] = record.increments[place]
-            for i, matrix in enumerate(_gradients(body)):
-                slope_y, slope_z = matrix.createVecLeft(), matrix.createVecLeft()
-                matrix.mult(y, slope_y)
-                matrix.mult(backgrounds[place], slope_z)
-                total[:, i] += (slope_y.array_r.reshape(-1, gdim) * v).sum(axis=1)
-                total[:, i] -= (slope_z.array_r.reshape(-1, gdim) * forces_here).sum(axis=1)
+            slopes = Slopes(body)
+            total += np.einsum("nci,nc->ni", slopes.of(y), v)
+            total -= np.einsum("nci,nc->ni", slopes.of(backgrounds[place]), forces_here)
             motion.x.array[: total.size] = total.ravel()
             motion.x.scatter_forward()
         return Gone(moved, backgrounds, laws)
@@ -264,18 +260,6 @@ class Backward:
 def copied(memories: Sequence[Sequence[State]]) -> list[list[State]]:
     """Return the states of the bodies' materials, as arrays that nobody else changes."""
     return [[{name: v.copy() for name, v in own.items()} for own in body] for body in memories]
-
-
-def _gradients(body: Particles) -> list[PETSc.Mat]:
-    """Return matrices of derivatives of functions on V, in each direction, at a body's nodes."""
-    basis = body.node_gradients()
-    assert basis.gradients is not None
-    return [
-        transfer_matrix(
-            basis._replace(values=np.ascontiguousarray(basis.gradients[:, :, i])), body.W, body.V
-        )
-        for i in range(basis.gradients.shape[2])
-    ]
 
 
 def _vector(function: fem.Function) -> PETSc.Vec:

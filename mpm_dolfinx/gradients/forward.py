@@ -33,15 +33,16 @@ from ..errors import MPMError
 from ..materials.base import State
 from ..parallel.magnitudes import norm
 from ..particles.field import CarriedField
+from ..particles.particles import Particles
 from ..problems.motion import MovingProblem
 from ..problems.problem import Problem
 from ..stepping.trial import Trial
 from ..system.value_field import ValueField
 from ..tolerances import DIFFERENCE
-from ..transfer.matrix import transfer_matrix
 from .nearby import Nearby, Rates, add_product, followed, varying
 from .parameters import Parameter
-from .velocities import TakenVelocities, driven_on
+from .slopes import Slopes, along
+from .velocities import Beginning, TakenVelocities, driven_on
 
 __all__ = ["StepDerivative"]
 
@@ -60,26 +61,14 @@ class _Side(NamedTuple):
         states: What laws answer.
         seen: What they have seen.
         kept: What the next step begins with besides.
+        begun: What a motion begins with.
     """
 
     forces: list[Array]
     states: list[list[State]]
     seen: list[Array]
     kept: list[Array]
-
-
-class _Change(NamedTuple):
-    """Derivatives of what a motion takes over: see :meth:`.MovingProblem.after_motion`.
-
-    Attributes:
-        changes: Of Dirichlet values, on own dofs of each background.
-        taken: Of the velocities that the step's background can follow, if it follows them.
-        background: The same on the backgrounds.
-    """
-
-    changes: list[Array]
-    taken: list[PETSc.Vec] | None = None
-    background: list[PETSc.Vec] | None = None
+    begun: Beginning = Beginning([], [])
 
 
 class StepDerivative:
@@ -98,13 +87,13 @@ class StepDerivative:
         self._solve = trial.newton.linearise()
         self._size = self._reduced.scale()
         self._y = [field.u.copy() for field in self._fields]
+        self._own = [field.changes() for field in self._fields]
         self._z = [y.copy() for y in self._y]
         for z, field in zip(self._z, self._fields, strict=True):
             if isinstance(field, ValueField):
                 z.axpy(1.0, field.start)
-        self._r = self._reduced.terms.last_nodal_forces()
         self._things = self._reduced.bodies
-        self._bases = [thing.node_gradients() for thing in self._things]
+        self._slopes = [Slopes(thing) for thing in self._things]
         places = followed(problem)
         self._numbers = [
             next(n for n, one in enumerate(places) if one is thing) for thing in self._things
@@ -112,11 +101,17 @@ class StepDerivative:
         self._of_fields = [
             self._fields.index(self._reduced.unknowns.place(thing)[0]) for thing in self._things
         ]
+        pairs = zip(self._slopes, self._of_fields, strict=True)
+        self._slopes_of_z = [slopes.of(self._z[field]) for slopes, field in pairs]
+        self._r = []
+        for thing, force in zip(self._things, self._reduced.terms.last_nodal_forces(), strict=True):
+            self._r.append(thing.T.createVecLeft())
+            self._r[-1].array_w[:] = force
         self._moving = problem if isinstance(problem, MovingProblem) else None
         projected = None if self._moving is None else self._moving.inertia.projected
         self._velocities: TakenVelocities | None = None
         if self._moving is not None and projected is not None:
-            self._velocities = TakenVelocities(self._moving, projected, nearby)
+            self._velocities = TakenVelocities(self._moving, projected, self._slopes)
 
     def by(self, parameter: Parameter, rates: Rates) -> Rates:
         """Return the derivatives at the end of the step from those at its beginning.
@@ -125,26 +120,35 @@ class StepDerivative:
             MPMError: There is no state beside that of the step, or no solution.
         """
         prescribed = self._prescribed(parameter, rates)
-        turns = [self._turn(number, rates) for number in range(len(self._bases))]
-        change = self._change(parameter, rates, turns, prescribed)
+        carried = [self._carried(thing, rates) for thing in self._things]
+        changes = self._changes(prescribed, rates.prescribed)
+        taken: list[PETSc.Vec] | None = None
         moduli = self._moduli(parameter, rates)
         y_rate = self._lifts(prescribed, rates.prescribed)
         motion = [_copy(function) for function in rates.motion]
-        for thing, number, field, turn in zip(
-            self._things, self._numbers, self._of_fields, turns, strict=True
+        for thing, number, slope, v in zip(
+            self._things, self._numbers, self._slopes_of_z, carried, strict=True
         ):
             if isinstance(thing, CarriedField) and thing.total:
                 motion[number].x.array[:] = 0.0
-            add_product(motion[number], turn, self._z[field])
+            turned = along(slope, v)
+            motion[number].x.array[: len(turned)] += turned
         self._move(motion, y_rate)
-        held = self._held(parameter, moduli, turns)
+        held = self._held(parameter, moduli, carried)
         first, last = 0.0, np.inf
         signs = [1.0, -1.0]
         for tried in range(MOST + 1):
             signs.reverse()  # it goes on where it is
             whole = tried > 0  # what the step leaves is of a motion that has been corrected
-            found = {s: self._beside(parameter, s, rates, motion, change, whole) for s in signs}
+            found = {}
+            for sign in signs:
+                self._go(parameter, sign, rates, motion)
+                amount = sign * parameter.change
+                beside = [own + amount * r for own, r in zip(self._own, changes, strict=True)]
+                found[sign] = self._end(amount, beside, taken) if whole else self._begun(beside)
             sides = [found[1.0], found[-1.0]]
+            if self._velocities is not None and not whole:
+                taken = self._velocities.by(parameter, carried, [side.begun for side in sides])
             forces = self._forces(parameter, sides)
             self._add_background(forces, held, y_rate)
             rest = self._reduced.unknowns.restricted(forces)
@@ -184,31 +188,16 @@ class StepDerivative:
 
     # -- What the step's beginning and its conditions change -------------------------------
 
-    def _turn(self, number: int, rates: Rates) -> PETSc.Mat:
-        """Return D of a body or a field on it: how T changes as its nodes move."""
-        thing, basis = self._things[number], self._bases[number]
-        assert basis.gradients is not None
+    def _carried(self, thing: Particles | CarriedField, rates: Rates) -> Array:
+        """Return how the nodes of a body, or of a field on it, move at the step's beginning."""
         body = thing.field.particles if isinstance(thing, CarriedField) else thing
         place = next(n for n, one in enumerate(self._problem.bodies) if one is body)
-        motion = thing.carried_by(rates.motion[place].x.array)
-        values = np.einsum("nki,ni->nk", basis.gradients, motion[: len(basis.nodes)])
-        return transfer_matrix(basis._replace(values=values), thing.W, thing.V)
+        return thing.carried_by(rates.motion[place].x.array)
 
-    def _change(
-        self,
-        parameter: Parameter,
-        rates: Rates,
-        turns: Sequence[PETSc.Mat],
-        prescribed: Sequence[Array],
-    ) -> _Change:
-        """Return derivatives of what a motion takes over."""
-        if self._moving is None:
-            return _Change([])
-        pairs = zip(prescribed, rates.prescribed, self._y, strict=True)
-        changes = [(now - before)[: y.getLocalSize()] for now, before, y in pairs]
-        if self._velocities is None:
-            return _Change(changes)
-        return _Change(changes, *self._velocities.by(parameter, rates, turns, changes))
+    def _changes(self, now: Sequence[Array], before: Sequence[Array]) -> list[Array]:
+        """Return derivatives of changes of Dirichlet values, on own dofs of each background."""
+        pairs = zip(now, before, self._y, strict=True)
+        return [(after - start)[: y.getLocalSize()] for after, start, y in pairs]
 
     def _prescribed(self, parameter: Parameter, rates: Rates) -> list[Array]:
         """Return the derivative of the Dirichlet totals at the step's end."""
@@ -266,16 +255,16 @@ class StepDerivative:
         return rates.moduli | dict(zip(new, found, strict=True))
 
     def _held(
-        self, parameter: Parameter, moduli: dict[int, Array], turns: Sequence[PETSc.Mat]
+        self, parameter: Parameter, moduli: dict[int, Array], carried: Sequence[Array]
     ) -> list[PETSc.Vec]:
         """Return ``D^T r + G' y`` on own dofs of each V."""
         found = [y.duplicate() for y in self._y]
         for force in found:
             force.set(0.0)
-        for number, turn, r in zip(self._of_fields, turns, self._r, strict=True):
-            nodal, force = turn.createVecLeft(), found[number]
-            nodal.array_w[:] = r
-            turn.multTransposeAdd(nodal, force, force)
+        for number, slopes, v, r in zip(
+            self._of_fields, self._slopes, carried, self._r, strict=True
+        ):
+            slopes.add_transposed(v, r, found[number])
         for number, rate in moduli.items():
             field = self._fields[number]
             own = np.array(field.acting.moduli)
@@ -288,46 +277,55 @@ class StepDerivative:
 
     # -- The solution -----------------------------------------------------------------------
 
-    def _beside(
-        self,
-        parameter: Parameter,
-        sign: float,
-        rates: Rates,
-        motion: Sequence[fem.Function],
-        change: _Change,
-        whole: bool,
-    ) -> _Side:
-        """Return an evaluation on one side of the state, in the direction of a motion.
-
-        Only its forces, unless it is to be whole.
-        """
-        points = self._problem.points
+    def _go(
+        self, parameter: Parameter, sign: float, rates: Rates, motion: Sequence[fem.Function]
+    ) -> None:
+        """Go to one side of the state, in the direction of a motion, and evaluate forces."""
         arrays = [function.x.array for function in motion]
         self._nearby.go(parameter, sign * parameter.change, rates, arrays)
         self._require(self._reduced.balance.evaluate_beside(), parameter)
-        forces = [force.array_r.copy() for force in self._reduced.unknowns.forces]
-        if not whole:
-            return _Side(forces, [], [], [])
+
+    def _begun(self, changes: Sequence[Array]) -> _Side:
+        """Return the forces of this side, and what a motion begins with there."""
+        side = _Side(self._evaluated(), [], [], [])
+        if self._velocities is None:
+            return side
+        return side._replace(begun=self._velocities.beside(changes))
+
+    def _end(
+        self, amount: float, changes: Sequence[Array], taken: Sequence[PETSc.Vec] | None
+    ) -> _Side:
+        """Return this side of the step's end.
+
+        Args:
+            amount: Change of the parameter.
+            changes: Of Dirichlet values.
+            taken: Derivatives of the velocities that the background can follow, if it does.
+        """
+        points = self._problem.points
+        forces = self._evaluated()
         # (what follows may ask the laws again, which may answer in the same arrays)
         states = [[_copies(varying(one)) for one in own.trial.states] for own in points]
         seen = [own.trial.gradient.copy() for own in points]
-        kept = [array.copy() for array in self._kept(sign * parameter.change, change)]
-        return _Side(forces, states, seen, kept)
-
-    def _kept(self, amount: float, change: _Change) -> list[Array]:
-        """Return the other arrays that the next step begins with, beside the state."""
         if self._moving is None:
-            return self._problem.at_end()
-        pairs = zip(self._fields, change.changes, strict=True)
-        changes = [field.changes() + amount * rate for field, rate in pairs]
-        if change.taken is None:
-            return self._moving.after_motion(changes)
-        projected = self._moving.inertia.projected
-        assert projected is not None
-        taken = [v.copy() for v in projected.velocity]
-        for velocity, rate in zip(taken, change.taken, strict=True):
+            kept = self._problem.at_end()
+        elif taken is None:
+            kept = self._moving.after_motion(changes)
+        else:
+            kept = self._moving.after_motion(changes, self._taken(amount, taken))
+        return _Side(forces, states, seen, [array.copy() for array in kept])
+
+    def _evaluated(self) -> list[Array]:
+        """Return the forces of the last evaluation."""
+        return [force.array_r.copy() for force in self._reduced.unknowns.forces]
+
+    def _taken(self, amount: float, rates: Sequence[PETSc.Vec]) -> list[PETSc.Vec]:
+        """Return the velocities that the background can follow, with a change."""
+        assert self._moving is not None and self._moving.inertia.projected is not None
+        found = [v.copy() for v in self._moving.inertia.projected.velocity]
+        for velocity, rate in zip(found, rates, strict=True):
             velocity.axpy(amount, rate)
-        return self._moving.after_motion(changes, taken)
+        return found
 
     def _forces(self, parameter: Parameter, sides: Sequence[_Side]) -> list[PETSc.Vec]:
         """Return derivatives of forces."""

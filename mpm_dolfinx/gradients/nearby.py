@@ -160,8 +160,6 @@ class Nearby:
             self._govern(parameter, amount)
         if parameter.outside and self._moving is not None and self._of_mass is not None:
             self._weigh(self._moving, self._of_mass, (id(parameter), amount))
-        if parameter.outside and not self._has_past:
-            self._problem.renew_external()
 
     def _govern(self, parameter: Parameter, amount: float) -> None:
         """Let materials take over a changed parameter; what they make of it is kept."""
@@ -205,6 +203,7 @@ class Nearby:
             array[...] = values + amount * rate
         if here.side is not None and _same(here.side, (parameter, amount, rates)):
             return  # only what moves is another one
+        stale = self._has_past or parameter.outside or (here.moved and here.moved.outside)
         if here.moved is not parameter:
             self._restore()
         here.moved, here.side = parameter, (parameter, amount, rates)
@@ -219,7 +218,7 @@ class Nearby:
         for points, states, own in zip(here.points, here.states, rates.states, strict=True):
             points.go_from([_moved(*pair, amount) for pair in zip(states, own, strict=True)])
         self._shift(parameter, amount)
-        if self._has_past:
+        if stale:
             self._problem.renew_external()
 
     @contextmanager

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,14 +123,30 @@ class Built:
             number: Number of the body.
             ratio: UFL; ``None``: that of the mass per volume of its mesh to the density.
         """
-        body, mass = self.bodies[number], self.contributions[number].mass
-        assert mass is not None
-        space = separate_nodes(body.W)
-        product = ufl.TrialFunction(space) * ufl.TestFunction(space)
-        ratio = body.undeformed.mass_ratio if ratio is None else ratio
-        matrix = fem.assemble_matrix(compiled_form(mass(ratio * product), **self.form_options))
-        n, k = body.num_local, space.dofmap.list.shape[1]
+        form = self._mass_forms[number] if ratio is None else self._mass_form(number, ratio)
+        assert form is not None
+        matrix = fem.assemble_matrix(form)
+        body = self.bodies[number]
+        n, k = body.num_local, body.W.dofmap.list.shape[1]
         return np.array(matrix.data[: n * k * k].reshape(n, k, k))
+
+    @cached_property
+    def _mass_forms(self) -> list[fem.Form | None]:
+        """Forms of the masses of bodies, where these are known (collective)."""
+        return [
+            None if given.mass is None else self._mass_form(number, body.undeformed.mass_ratio)
+            for number, (given, body) in enumerate(
+                zip(self.contributions, self.bodies, strict=True)
+            )
+        ]
+
+    def _mass_form(self, number: int, ratio: Any) -> fem.Form:
+        """Compile the form of the mass of a body (collective)."""
+        mass = self.contributions[number].mass
+        assert mass is not None
+        space = separate_nodes(self.bodies[number].W)
+        product = ufl.TrialFunction(space) * ufl.TestFunction(space)
+        return compiled_form(mass(ratio * product), **self.form_options)
 
     def masses(self, number: int) -> NDArray[np.float64] | None:
         """Return the mass of each particle of a body that this rank owns, if it is known."""
