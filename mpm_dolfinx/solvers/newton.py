@@ -124,6 +124,11 @@ class NewtonSolver:
         return 0 if self._attempt is None else self._attempt.steps.count
 
     @property
+    def unstable(self) -> bool:
+        """Whether a tangent of the last attempt was symmetric, and not positive definite."""
+        return self._attempt is not None and self._attempt.steps.indefinite > 0
+
+    @property
     def flips(self) -> list[NDArray[np.int64]]:
         """How often each particle began or ceased to yield, late in the last attempt, by body."""
         yielding = [] if self._attempt is None else self._attempt.yielding

@@ -29,6 +29,7 @@ class Steps:
 
     Attributes:
         count: Linear solves so far.
+        indefinite: How many of their tangents were symmetric, and not positive definite.
         refines: Whether steps are those of the tangent itself, without the shift.
         refined: Relative residual of a step that is.
     """
@@ -40,7 +41,7 @@ class Steps:
         self._shortens = shorten and not problem.softens
         self._negative = 0  # eigenvalues that are permitted
         self._origin: PETSc.Vec | None = None
-        self.count = 0
+        self.count = self.indefinite = 0
         self.refines, self.refined = False, SMALL
 
     def follow(self, damping: float = 0.0, K: PETSc.Mat | None = None) -> None:
@@ -104,6 +105,7 @@ class Steps:
         if not self._symmetric:
             y.scale(-1.0)
             return True
+        self.indefinite += 1
         self._factor.give_up(self._shortens)
         for damping in DAMPINGS:
             self.follow(damping, self._factor.K)

@@ -69,6 +69,7 @@ def placed(
     load: float,
     limit: str | None = None,
     flips: Sequence[NDArray[np.int64]] = (),
+    unstable: bool = False,
 ) -> MPMError:
     """Return an error that says at what load it happened, and what to do (collective).
 
@@ -78,6 +79,7 @@ def placed(
         load: Load, or parameter of the path, at the last converged step.
         limit: Beyond what no step gets, if that may be a limit, and what to do.
         flips: How often each particle began or ceased to yield, by body.
+        unstable: Whether equilibrium seems to have lost its stability.
     """
     advice = {
         DomainDistortionError: "; take more steps, smaller loads or finer domains",
@@ -107,6 +109,11 @@ def placed(
             advice = "; move the background or the bodies a little, or use stabilisation='ghost'"
         else:
             text += _flipping(reduced, flips)
+        if unstable:
+            text += (
+                "; equilibrium may turn unstable there, as where a body buckles, necks or wrinkles "
+                "(tangents are indefinite)"
+            )
     told = type(error)(f"{text}, in the step after load {load:.6g}{advice}.", particles, load)
     told.dofs, told.where = dofs, error.where
     return told

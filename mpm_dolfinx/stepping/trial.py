@@ -305,4 +305,5 @@ class Trial:
 
     def placed(self, error: MPMError, limit: str | None = None) -> MPMError:
         """Return an error that says where and why its step failed (collective)."""
-        return placed(error, self.reduced, self.converged.parameter, limit, self.newton.flips)
+        newton, load = self.newton, self.converged.parameter
+        return placed(error, self.reduced, load, limit, newton.flips, newton.unstable)

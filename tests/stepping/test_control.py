@@ -70,9 +70,29 @@ def test_limit_load_is_told():
     assert problem.history.total_iterations < 350
     if isinstance(error, mpm.ConvergenceError):
         assert "no step, however small, gets to 0.50" in str(error)
+        assert "unstable" not in str(error)
         assert len(error.dofs) == 1 and f"dof {error.dofs[0]} of V near (" in str(error)
         assert 0 <= error.dofs[0] < problem.particles.T.getSize()[1]
         assert error.particles
+
+
+def test_necking_is_told_from_flow():
+    # Hencky's bar in plane strain bears E / (1 - nu^2) / e at most, at the stretch e.
+    largest = 1e3 / 0.91 / np.e
+    body = scenes.box([0.0, 0.0], [1.0, 0.25], [2, 1], QUADRILATERAL)
+    particles = mpm.Particles(body)
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(1e3, 0.3),
+            tractions=[((1.1 * largest, 0.0), 1)],
+            facet_tags=scenes.facet_tags(body, scenes.at(0, 1.0)),
+        ),
+        bcs=[scenes.fix(particles.W, scenes.at(i, 0.0), component=i) for i in (0, 1)],
+    )
+    with pytest.raises(mpm.ConvergenceError, match="may turn unstable there, as where a body buckles"):
+        problem.solve(steps=5)
+    assert 0.99 / 1.1 < problem.history.load[-1] < 1.0 / 1.1
 
 
 @pytest.mark.parametrize("n", [1, 3, 7, 40])
