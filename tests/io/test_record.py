@@ -34,23 +34,24 @@ def bar():
 
 def test_curves_of_two_runs(mpi_tmp_path):
     problem, drawn, curve = bar()
-    wall, tips, yielded = problem.bcs[1], [], []
+    wall, tips, yielded = problem.bcs[1], [np.array([0.0, 0.0])], []
     back = problem.steps(2, update=lambda t: setattr(drawn, "value", 0.2 - 0.1 * t))
     for run in (problem.steps(4), back):
         for step in curve.follow(run):
             yielded.append(step)
             tips.append(mpm.probe(problem.particles, (LENGTH, 0.5)))
             assert np.isclose(curve["force"][-1], -problem.reaction(wall)[0], rtol=1e-7)
-    assert yielded == problem.history.steps and len(curve["time"]) == 6
+    assert yielded == problem.history.steps and len(curve["time"]) == 7
     assert list(curve) == ["time", "load", "force", "tip", "stress"]
     for name in ("time", "load"):
-        assert np.array_equal(curve[name], [getattr(step, name) for step in yielded])
-    assert np.array_equal(curve["tip"], tips) and curve["stress"].shape == (6, 2, 3, 3)
-    assert np.allclose(curve["tip"][:, 0], [0.05, 0.1, 0.15, 0.2, 0.15, 0.1], atol=1e-10)
+        assert np.array_equal(curve[name], [0.0, *(getattr(step, name) for step in yielded)])
+    assert np.array_equal(curve["tip"], tips) and curve["stress"].shape == (7, 2, 3, 3)
+    assert np.allclose(curve["tip"][:, 0], [0.0, 0.05, 0.1, 0.15, 0.2, 0.15, 0.1], atol=1e-10)
+    assert curve["force"][0] == 0.0 and not curve["stress"][0].any()
     stretch = 1.025  # the first step, before the end goes on into the next cell
     exact = YOUNG * np.log(stretch) / stretch  # over an area that stays 1
-    assert np.allclose(curve["force"][0], exact, rtol=1e-7)
-    assert np.allclose(curve["stress"][0, :, 0, 0], exact, rtol=1e-7)
+    assert np.allclose(curve["force"][1], exact, rtol=1e-7)
+    assert np.allclose(curve["stress"][1, :, 0, 0], exact, rtol=1e-7)
 
     curve.write(mpi_tmp_path / "curve.csv")
     table = np.genfromtxt(mpi_tmp_path / "curve.csv", delimiter=",", names=True)
@@ -73,7 +74,7 @@ def test_a_step_that_is_halved_is_noted_once_it_has_converged():
     for _ in curve.follow(problem.steps(2, update=path)):
         pass
     assert problem.history.cutbacks == 1 and failed == [1.0]
-    assert np.allclose(curve["tip"][:, 0], 0.2 * np.array([0.5, 0.75, 1.0]), atol=1e-10)
+    assert np.allclose(curve["tip"][:, 0], 0.2 * np.array([0.0, 0.5, 0.75, 1.0]), atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -100,6 +101,32 @@ def test_a_column_keeps_its_shape():
     with pytest.raises(mpm.MPMError, match=r"shape \(2,\), and had \(\) before"):
         list(curve.follow(problem.steps(2)))
     assert len(curve["force"]) == len(curve["load"]) == 1
+
+
+def test_a_run_that_goes_on_begins_where_it_was_left(mpi_tmp_path):
+    problem, _, curve = bar()
+    for step in curve.follow(problem.steps(4)):
+        if step.load == 0.5:
+            problem.save(mpi_tmp_path / "half.npz")
+            break
+    assert np.array_equal(curve["load"], [0.0, 0.25, 0.5])
+    again, _, rest = bar()
+    again.restore(mpi_tmp_path / "half.npz")
+    list(rest.follow(again.steps(4)))
+    assert np.array_equal(rest["load"], [0.5, 0.75, 1.0])
+    for name in curve:
+        assert np.array_equal(rest[name][0], curve[name][-1])
+    list(curve.follow(problem.steps(2)))  # from where the loop was left: no row twice
+    assert np.array_equal(curve["load"], [0.0, 0.25, 0.5, 0.75, 1.0])
+
+
+def test_what_is_not_known_before_the_first_step_is_no_number():
+    problem, _, _ = bar()
+    curve = mpm.Record(problem, norms=lambda: problem.history.steps[-1].residuals[:2])
+    list(curve.follow(problem.steps(2)))
+    assert curve["norms"].shape == (3, 2) and np.isnan(curve["norms"][0]).all()
+    residuals = [step.residuals for step in problem.history.steps]
+    assert np.array_equal(curve["norms"][1:], [each[:2] for each in residuals])
 
 
 @pytest.mark.mpi

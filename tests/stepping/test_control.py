@@ -90,7 +90,7 @@ def test_necking_is_told_from_flow():
         ),
         bcs=[scenes.fix(particles.W, scenes.at(i, 0.0), component=i) for i in (0, 1)],
     )
-    with pytest.raises(mpm.ConvergenceError, match="may turn unstable there, as where a body buckles"):
+    with pytest.raises(mpm.ConvergenceError, match="may turn unstable there"):
         problem.solve(steps=5)
     assert 0.99 / 1.1 < problem.history.load[-1] < 1.0 / 1.1
 
