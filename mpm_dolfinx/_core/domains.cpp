@@ -249,6 +249,49 @@ private:
   std::vector<double> blocks_;
 };
 
+// The gradients of the background basis that the single points of a group's domains see.
+template <int dim>
+class BackgroundGradients
+{
+public:
+  BackgroundGradients(const Domains& domains, const Rows& rows, const Support& support)
+      : domains_(domains), rows_(rows), support_(support), slot_(rows.num_nodes)
+  {
+  }
+
+  void begin(std::size_t group)
+  {
+    const std::int32_t* nodes = support_.nodes + support_.ends[group];
+    const std::size_t width = width_of(support_, group);
+    for (std::size_t slot = 0; slot < width; ++slot)
+      slot_[nodes[slot]] = static_cast<std::uint16_t>(slot);
+    gradients_.resize(width * dim);
+  }
+
+  // Those of a domain, by the slots of its nodes.
+  const double* of(std::size_t p)
+  {
+    for (std::int64_t e = support_.offsets[p]; e < support_.offsets[p + 1]; ++e)
+      std::fill_n(gradients_.data() + support_.slots[e] * dim, dim, 0.0);
+    for (int c = 0; c < domains_.nodes; ++c)
+    {
+      const std::int32_t row = domains_.dofmap[p * domains_.nodes + c];
+      const double* gradient = domains_.gradients + (p * domains_.nodes + c) * dim;
+      for (std::int64_t e = rows_.offsets[row]; e < rows_.offsets[row + 1]; ++e)
+        for (int J = 0; J < dim; ++J)
+          gradients_[slot_[rows_.nodes[e]] * dim + J] += rows_.values[e] * gradient[J];
+    }
+    return gradients_.data();
+  }
+
+private:
+  const Domains& domains_;
+  const Rows& rows_;
+  const Support& support_;
+  std::vector<std::uint16_t> slot_; // of the group's nodes
+  std::vector<double> gradients_;
+};
+
 // Room for the products of one domain.
 struct Work
 {
@@ -520,28 +563,6 @@ void core::local_transfers(const Dofmap& dofmap, const Rows& rows, const Groups&
   });
 }
 
-void core::support_gradients(const Domains& domains, const Rows& rows, const Groups& groups,
-                             const Support& support, double* gradients)
-{
-  with_dimension(domains.dim, [&](auto constant) {
-    constexpr int dim = constant;
-    std::fill(gradients, gradients + support.offsets[domains.count] * dim, 0.0);
-    for_each_domain(groups, [&](std::size_t g, std::size_t p) {
-      for (int c = 0; c < domains.nodes; ++c)
-      {
-        const std::int32_t row = domains.dofmap[p * domains.nodes + c];
-        const double* gradient = domains.gradients + (p * domains.nodes + c) * dim;
-        for (std::int64_t e = rows.offsets[row]; e < rows.offsets[row + 1]; ++e)
-        {
-          const std::size_t a = place_of(support, g, p, rows.nodes[e]);
-          for (int J = 0; J < dim; ++J)
-            gradients[(support.offsets[p] + a) * dim + J] += rows.values[e] * gradient[J];
-        }
-      }
-    });
-  });
-}
-
 std::vector<std::uint8_t> core::seen_pairs(const Groups& groups, const Support& rows,
                                            const Support& columns)
 {
@@ -558,31 +579,33 @@ std::vector<std::uint8_t> core::seen_pairs(const Groups& groups, const Support& 
   return result;
 }
 
-HOT_LOOP void core::assemble_points(const Domains& domains, const double* support_gradients,
-                                    const double* A, bool symmetric, const Target& target)
+HOT_LOOP void core::assemble_points(const Domains& domains, const Rows& rows, const double* A,
+                                    bool symmetric, const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
     constexpr int dim = constant;
     constexpr int stride = Line<dim>::length;
     const Support& support = target.row;
     GroupBlocks<dim, dim, stride> blocks(target);
+    BackgroundGradients<dim> gradients(domains, rows, support);
     for (std::size_t g = 0; g < target.groups.count; ++g)
     {
       blocks.begin(g);
+      gradients.begin(g);
       for_each_domain_of(target.groups, g, [&](std::size_t p) {
         PointTangent<dim> tangent(A + p * dim * dim * dim * dim, domains.weights[p]);
         const std::size_t size = size_of(support, p);
-        const double* S = support_gradients + support.offsets[p] * dim;
         const std::uint16_t* slots = support.slots + support.offsets[p];
+        const double* S = gradients.of(p);
         for (std::size_t a = 0; a < size; ++a)
         {
-          tangent.contract(S + a * dim);
+          tangent.contract(S + slots[a] * dim);
           for (std::size_t b = symmetric ? a : 0; b < size; ++b)
           {
             double* out = blocks(slots[a], slots[b]);
             for (int i = 0; i < dim; ++i)
               *reinterpret_cast<typename Line<dim>::type*>(out + i * stride)
-                  += tangent.line(i, S + b * dim);
+                  += tangent.line(i, S + slots[b] * dim);
           }
         }
       });

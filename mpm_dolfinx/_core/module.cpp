@@ -536,19 +536,6 @@ NB_MODULE(_loops, m)
         "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a, "groups"_a, "support"_a,
         "transfers"_a.noconvert(), "Set the values of T of each domain's nodes.");
 
-  m.def("support_gradients",
-        [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
-           const GroupArrays& groups, const SupportArrays& support, RealsOut result) {
-    const Domains domains = domains_of(dofmap, gradients, nullptr);
-    require(domains.points == 1 && result.size() == std::get<1>(support).size() * domains.dim,
-            "gradients of domains with one point");
-    support_gradients(domains, rows_of(offsets, nodes, values), groups_of(groups),
-                      support_of(groups, support), result.data());
-  },
-        "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "groups"_a, "support"_a,
-        "result"_a.noconvert(),
-        "Set the gradients of the background basis at each domain's single point.");
-
   m.def("seen_pairs",
         [](const GroupArrays& groups, const SupportArrays& rows, const SupportArrays& columns) {
     return to_numpy(
@@ -648,16 +635,17 @@ NB_MODULE(_loops, m)
         "add"_a, of_entries);
 
   m.def("assemble_points",
-        [](Indices dofmap, Reals gradients, Reals weights, Reals support_gradients, Reals A,
-           bool symmetric, const Where& where) {
+        [](Indices dofmap, Reals gradients, Reals weights, Offsets offsets, Indices nodes,
+           Reals values, Reals A, bool symmetric, const Where& where) {
     const Domains domains = domains_of(dofmap, gradients, &weights);
     const int square = domains.dim * domains.dim;
     require(domains.points == 1 && A.size() == domains.count * square * square,
             "A (n, dim, dim, dim, dim) of domains with one point");
-    assemble_points(domains, support_gradients.data(), A.data(), symmetric, target_of(where));
+    assemble_points(domains, rows_of(offsets, nodes, values), A.data(), symmetric,
+                    target_of(where));
   },
-        "dofmap"_a, "gradients"_a, "weights"_a, "support_gradients"_a, "A"_a, "symmetric"_a,
-        "where"_a, "Add the reduced tangents of domains with one point.");
+        "dofmap"_a, "gradients"_a, "weights"_a, "offsets"_a, "nodes"_a, "values"_a, "A"_a,
+        "symmetric"_a, "where"_a, "Add the reduced tangents of domains with one point.");
 
   m.def("assemble_domains",
         [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals transfers, Reals A,

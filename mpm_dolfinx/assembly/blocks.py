@@ -314,7 +314,7 @@ class Block:
 
     def transfer(self, field: Restriction) -> None:
         """Take over the values of T."""
-        self._rows, self._masses = field.rows, None
+        self._masses = None
         if self._loops:
             for body, rows in zip(self._loops, field.rows, strict=True):
                 body.transfer(rows)
@@ -332,10 +332,10 @@ class Block:
         if self._loops:
             own = self.beside(self)
             self._masses = np.zeros(len(own.nodes))
-            for number, (body, rows) in enumerate(zip(self._loops, self._rows, strict=True)):
+            for number, body in enumerate(self._loops):
                 for particles, mass in masses:
                     if particles is body.particles:
-                        body.add_masses(mass, rows, own.where(number), self._masses)
+                        body.add_masses(mass, own.where(number), self._masses)
             self._add_masses(1.0)
         self._exchange()
 

@@ -27,6 +27,9 @@ type Where = tuple[Any, ...]
 #: half as many, or twice, assembly in space takes 5 to 10 % longer.
 GROUP = 48
 
+#: No rows of T.
+no_rows = TransferRows(np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int32), no_values)
+
 
 class Support:
     """The background nodes that each domain of a body sees, and T of its nodes.
@@ -64,11 +67,6 @@ class Support:
         """
         return self._nodes
 
-    @property
-    def size(self) -> int:
-        """How many nodes domains see, all added up."""
-        return len(self._nodes[1])
-
     def find(self, rows: TransferRows) -> bool:
         """Find the nodes; return whether they are the old ones."""
         given = self._first[:0] if self._host is None else self._host.groups[1]
@@ -82,7 +80,7 @@ class Support:
 
     def transfers(self, rows: TransferRows) -> NDArray[np.float64]:
         """Return T of each domain, ``(number of nodes, k)`` one after the other."""
-        found = np.empty((self.size, self._dofmap.shape[1]))
+        found = np.empty((len(self._nodes[1]), self._dofmap.shape[1]))
         loops.local_transfers(self._dofmap, *rows, self.groups, self.nodes, found)
         return found
 
@@ -103,17 +101,14 @@ class BodyLoops:
         first = _compat.geometry_dofmap(body)[: len(particles.domain_nodes), 0]
         order = morton_order(body.geometry.x[first, : body.geometry.dim])
         self.support = Support(particles.domain_nodes, order)
+        self._rows = no_rows
         self.transfers: NDArray[np.float64] = no_values
 
     def transfer(self, rows: TransferRows) -> None:
         """Take over the values of T."""
-        support = self.support
-        if self._points:
-            self._gradients = np.empty((support.size, self._domains[1].shape[-1]))
-            given = (*self._domains, *rows, support.groups, support.nodes)
-            loops.support_gradients(*given, self._gradients)
+        self._rows = rows
         if self._whole:
-            self.transfers = support.transfers(rows)
+            self.transfers = self.support.transfers(rows)
 
     def _vectors(self, term: LowRankTerm | None) -> NDArray[np.float64]:
         """Return left and right vectors of each domain in turn, ``(n, 2 m, k, gdim)``; or none."""
@@ -126,12 +121,11 @@ class BodyLoops:
     def add_masses(
         self,
         masses: NDArray[np.float64],
-        rows: TransferRows,
         where: Where,
         values: NDArray[np.float64],
     ) -> None:
         """Add the body's reduced mass, one number for each of the pattern's blocks."""
-        transfers = self.transfers if self._whole else self.support.transfers(rows)
+        transfers = self.transfers if self._whole else self.support.transfers(self._rows)
         loops.assemble_masses(*self._domains, transfers, masses, where, values)
 
     def _counted(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -146,7 +140,7 @@ class BodyLoops:
             loops.assemble_points(
                 *self._domains,
                 self._counted(internal.strain.weights),
-                self._gradients,
+                *self._rows,
                 internal.tangent,
                 internal.symmetric,
                 where,
