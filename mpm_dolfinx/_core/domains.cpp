@@ -896,11 +896,11 @@ void core::slope_sizes(const Domains& domains, const double* slope, const double
 
 namespace
 {
-// Call f(cell, K) with the element tensors of a form.
+// Call f(cell, K) with the element tensors of a form, of so many numbers each.
 template <typename F>
-void for_each_tensor(const core::Form& form, std::size_t width, F&& f)
+void for_each_tensor(const core::Form& form, std::size_t size, F&& f)
 {
-  std::vector<double> K(width * width), x(form.geometry_nodes * 3);
+  std::vector<double> K(size), x(form.geometry_nodes * 3);
   for (std::size_t e = 0; e < form.count; ++e)
   {
     const std::int32_t cell = form.entities[form.facets ? 2 * e : e];
@@ -927,7 +927,8 @@ HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, cons
     for_each_domain(target.groups, [&](std::size_t g, std::size_t p) {
       group[p] = static_cast<std::int32_t>(g);
     });
-    for_each_tensor(form, domains.nodes * dim, [&](std::int32_t cell, std::vector<double>& K) {
+    const std::size_t width = domains.nodes * dim;
+    for_each_tensor(form, width * width, [&](std::int32_t cell, std::vector<double>& K) {
       for (double& entry : K)
         entry *= factor;
       for_each_row<dim>(K.data(), domains.nodes, transfers + support.offsets[cell] * domains.nodes,
@@ -941,7 +942,7 @@ HOT_LOOP void core::assemble_form(const Form& form, const Domains& domains, cons
 void core::multiply_form(const Form& form, const Domains& domains, const double* u, double* force)
 {
   const int dim = domains.dim, width = domains.nodes * dim;
-  for_each_tensor(form, width, [&](std::int32_t cell, const std::vector<double>& K) {
+  for_each_tensor(form, width * width, [&](std::int32_t cell, const std::vector<double>& K) {
     const std::int32_t* nodes = domains.dofmap + static_cast<std::size_t>(cell) * domains.nodes;
     for (int r = 0; r < width; ++r)
     {
@@ -950,5 +951,13 @@ void core::multiply_form(const Form& form, const Domains& domains, const double*
         sum += K[r * width + s] * u[nodes[s / dim] * dim + s % dim];
       force[nodes[r / dim] * dim + r % dim] += sum;
     }
+  });
+}
+
+void core::domain_forces(const Form& form, std::size_t width, std::int32_t first, double* forces)
+{
+  for_each_tensor(form, width, [&](std::int32_t cell, const std::vector<double>& F) {
+    for (std::size_t r = 0; r < width; ++r)
+      forces[(cell - first) * width + r] += F[r];
   });
 }

@@ -179,4 +179,8 @@ void assemble_form(const Form& form, const Domains& domains, const double* trans
 
 // Add K u to the force at the nodes.
 void multiply_form(const Form& form, const Domains& domains, const double* u, double* force);
+
+// Add the element vectors of a compiled form to the forces of domains from the first on, (domain,
+// width).
+void domain_forces(const Form& form, std::size_t width, std::int32_t first, double* forces);
 } // namespace core

@@ -741,6 +741,20 @@ NB_MODULE(_loops, m)
         "form"_a, "dofmap"_a, "gradients"_a, "u"_a, "force"_a.noconvert(),
         "Add the product of the tensors of a compiled form and a displacement to the force.");
 
+  m.def("domain_forces", [](const Compiled& form, std::int32_t first, RealsOut forces) {
+    const Indices& entities = std::get<1>(form);
+    const auto last = first + static_cast<std::int32_t>(forces.shape(0));
+    require(forces.ndim() == 3, "forces (n, k, dim)");
+    for (std::size_t e = 0; e < entities.shape(0); ++e)
+    {
+      const std::int32_t cell = entities.data()[entities.ndim() * e];
+      require(cell >= first && cell < last, "entities of these domains alone");
+    }
+    domain_forces(form_of(form), forces.shape(1) * forces.shape(2), first, forces.data());
+  },
+        "form"_a, "first"_a, "forces"_a.noconvert(),
+        "Add the vectors of a compiled form to the forces (n, k, dim) of domains from the first on.");
+
   m.def("update_elastic",
         [](const std::string& law, Reals gradient, const std::vector<Reals>& parameters, RealsOut P,
            RealsOut A, RealsOut stress) {

@@ -48,6 +48,15 @@ def integrals_of(form: fem.Form, body: mesh.Mesh) -> Iterator[tuple[Any, ...]]:
         yield integral.kernel, integral.entities, *values, *geometry
 
 
+def _by_cell(integral: tuple[Any, ...]) -> tuple[NDArray[np.int32], tuple[Any, ...]]:
+    """Return the cells of an integral of :func:`integrals_of`, sorted, and it in their order."""
+    kernel, entities, values, *rest = integral
+    cells = entities if entities.ndim == 1 else entities[:, 0]
+    order = np.argsort(cells, kind="stable")
+    values = values[order] if len(values) > 0 else values  # (without coefficients: no rows)
+    return cells[order], (kernel, entities[order], values, *rest)
+
+
 class PointStress(Protocol):
     """Stress at a body's quadrature points, of which the compiled loops make forces."""
 
@@ -134,11 +143,9 @@ class BodyForms:
         self._live = self._compile(live)
         self._dead = self._compile(dead)
         load = particles.load
-        self._loaded = [
-            form
-            for part, form in zip([*live, *dead], [*self._live, *self._dead], strict=True)
-            if any(constant is load for constant in part.constants())
-        ]
+        every = list(zip([*live, *dead], [*self._live, *self._dead], strict=True))
+        self._loaded = [form for part, form in every if any(c is load for c in part.constants())]
+        self._alone = [form for part, form in every if self.takes(part)]
         self.follows_load = any(any(c is load for c in part.constants()) for part in live)
         together = [self.takes(form) for form in tangents]
         compiled = self._compile(tangents)
@@ -381,13 +388,14 @@ class BodyForms:
 
     @cached_property
     def _elementwise(self) -> tuple[list[fem.Form], fem.FunctionSpace]:
-        """The residual tested domain by domain, and the space of functions on single ones."""
+        """Parts that couple cells, tested domain by domain, and the space of these functions."""
         broken = fem.functionspace(
             self._body,
             ("Discontinuous Lagrange", self._element.degree, (self._element.block_size,)),
         )
         test = ufl.TestFunction(broken)
-        tested = [ufl.replace(part, {part.arguments()[0]: test}) for part in self._parts]
+        coupling = [part for part in self._parts if not self.takes(part)]
+        tested = [ufl.replace(part, {part.arguments()[0]: test}) for part in coupling]
         return self._compile(tested), broken
 
     def absolute_contributions(self, domain_nodes: NDArray[np.int32]) -> PETSc.Vec:
@@ -398,21 +406,29 @@ class BodyForms:
         gdim = self._element.block_size
         n, k = domain_nodes.shape
         external: NDArray[np.float64] = np.broadcast_to(0.0, (n, k, gdim))
-        if self._parts:
+        if not all(map(self.takes, self._parts)):
             forms, broken = self._elementwise
             vector = create_vector(broken)
             assemble_into(vector, forms)
             external = vector.array_r[: n * k * gdim].reshape(n, k, gdim)
+        integrals = [
+            _by_cell(integral)
+            for form in self._alone
+            for integral in integrals_of(form, self._body)
+        ]
         total = self.r.duplicate()
         with total.localForm() as local:
             local.set(0.0)
             count = local.getLocalSize() // gdim
             for first in range(0, n, BLOCK):
-                part = slice(first, first + BLOCK)
-                own = np.abs(external[part] + self._internal_forces(part))
-                nodes = domain_nodes[part].ravel()
+                part = slice(first, min(first + BLOCK, n))
+                own = external[part] + self._internal_forces(part)
+                for cells, (kernel, entities, values, *rest) in integrals:
+                    its = slice(*np.searchsorted(cells, [part.start, part.stop]))
+                    loops.domain_forces((kernel, entities[its], values[its], *rest), first, own)
+                size, nodes = np.abs(own), domain_nodes[part].ravel()
                 for i in range(gdim):
-                    local.array_w[i::gdim] += np.bincount(nodes, own[:, :, i].ravel(), count)
+                    local.array_w[i::gdim] += np.bincount(nodes, size[:, :, i].ravel(), count)
         total.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         return total
 
