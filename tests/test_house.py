@@ -57,6 +57,7 @@ def name_of(path: Path) -> str:
 
 PATHS = {name_of(path): path for path in sorted(ROOT.rglob("*.py"))}
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in PATHS.items()}
+NODES = {name: list(ast.walk(tree)) for name, tree in TREES.items()}
 FACES = {name for name, path in PATHS.items() if path.name == "__init__.py"}
 
 
@@ -66,7 +67,7 @@ def imports(name: str) -> Iterator[tuple[str, str]]:
     Those within functions and below ``if TYPE_CHECKING`` count as well.
     """
     package = name if name in FACES else name.rpartition(".")[0]
-    for node in ast.walk(TREES[name]):
+    for node in NODES[name]:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 if alias.name.split(".")[0] == PACKAGE:
@@ -119,10 +120,10 @@ def private(name: str) -> bool:
 
 def foreign_underscores() -> Iterator[str]:
     """Yield uses of what another object or another module keeps to itself."""
-    for name, tree in TREES.items():
+    for name, nodes in NODES.items():
         if name == BRIDGE:
             continue
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.Attribute) and private(node.attr):
                 owner = ast.unparse(node.value)
                 if owner not in ("self", "cls", "type(self)", "super()"):
@@ -151,14 +152,14 @@ def circles() -> Iterator[str]:
 
 def made_again() -> Iterator[str]:
     """Yield what empties objects, initialises them again, or asks whether it was made before."""
-    for name, tree in TREES.items():
+    for name, nodes in NODES.items():
         constructors = [
             node
-            for node in ast.walk(tree)
+            for node in nodes
             if isinstance(node, ast.FunctionDef) and node.name in ("__init__", "__new__")
         ]
         within = {id(inner) for node in constructors for inner in ast.walk(node)}
-        for node in ast.walk(tree):
+        for node in nodes:
             if isinstance(node, ast.Attribute) and node.attr == "__dict__":
                 yield f"{name}: {ast.unparse(node)}"
             if not isinstance(node, ast.Call):
@@ -174,8 +175,8 @@ def made_again() -> Iterator[str]:
 
 def long_constructors() -> Iterator[str]:
     """Yield the package's own classes that are made of too many things."""
-    for name, tree in TREES.items():
-        for node in ast.walk(tree):
+    for name, nodes in NODES.items():
+        for node in nodes:
             if not isinstance(node, ast.ClassDef) or node.name in PUBLIC_PROBLEMS:
                 continue
             for method in node.body:

@@ -8,6 +8,7 @@ import ast
 import hashlib
 import re
 import sys
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache, partial
 from pathlib import Path
@@ -86,17 +87,27 @@ def _path(thing: Any) -> Path | None:
     return path if any(path.is_relative_to(part) for part in OURS) else None
 
 
-def _source(thing: FunctionType | type, path: Path) -> Iterator[str]:
-    """Yield the code of a function or class; of lambdas all that begin in the same line."""
+@cache
+def _source(thing: FunctionType | type, path: Path) -> list[str]:
+    """Return the code of a function or class; of lambdas all that begin in the same line."""
+    kind, line = ast.FunctionDef, None
+    if isinstance(thing, type):
+        kind = ast.ClassDef
+    elif thing.__name__ == "<lambda>":
+        kind, line = ast.Lambda, thing.__code__.co_firstlineno
+    return [ast.unparse(node) for node in _nodes(path).get((kind, line or thing.__name__), [])]
+
+
+@cache
+def _nodes(path: Path) -> dict[tuple[type, str | int], list[ast.AST]]:
+    """Return the functions and classes of a file by their names, and lambdas by their lines."""
+    found = defaultdict(list)
     for node in ast.walk(_tree(path)):
-        if isinstance(thing, type):
-            mine = isinstance(node, ast.ClassDef) and node.name == thing.__name__
-        elif thing.__name__ == "<lambda>":
-            mine = isinstance(node, ast.Lambda) and node.lineno == thing.__code__.co_firstlineno
-        else:
-            mine = isinstance(node, ast.FunctionDef) and node.name == thing.__name__
-        if mine:
-            yield ast.unparse(node)
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found[type(node), node.name].append(node)
+        elif isinstance(node, ast.Lambda):
+            found[ast.Lambda, node.lineno].append(node)
+    return found
 
 
 def _used(function: FunctionType) -> Iterator[Any]:
