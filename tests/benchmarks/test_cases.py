@@ -20,6 +20,7 @@ CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 SHORT = ("compaction", "column_free")
 LONG = {
     *("sand-damped", "sand-dilates", "notch", "retrogression"),
+    *("cone", "cryer", "footing-weight", "wedge", "gradient-degree-2", "footing-friction"),
     *("gradient", "hertz-pair", "weight-recommended", "circle-recommended", "incline", "sand"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     "indentation",
@@ -28,13 +29,12 @@ LONG = {
         "slope",
         "slope-water",
         "vertical-cut",
-        "footing-friction",
         "footing-weight-rough",
         "footing-edge",
     ),
     *("finer-footing", "mixed-footing"),
     *("stiff-footing", "sphere", "sphere-penalty", "sphere-tets", "expansion-whole", "pile-deep"),
-    *("taylor-whole", "pipe-rough", "wedge-fine", "ironing-stiff"),
+    *("taylor-whole", "pipe-fine", "pipe-rough", "wedge-fine", "ironing-stiff"),
     *("collapse-patch", "roller-hex", "compaction-tri", "compaction-mpm", "roller-patch"),
 }
 COMMON = {"completed", "load", "iterations", "cutbacks", "failure"}
@@ -263,7 +263,8 @@ RUNS = {
         "--depth 0.5 --cell 0.5 --steps 12",
         {"cutbacks": 0, "iterations": 85, "factor": 6.2},
     ),
-    "pipe": ("pipe", "--steps 6", {"ratio": 1.03, "cutbacks": 0, "iterations": 120}),
+    "pipe": ("pipe", "--steps 6 --cell 0.25", {"ratio": 1.06, "cutbacks": 0, "iterations": 80}),
+    "pipe-fine": ("pipe", "--steps 6", {"ratio": 1.03, "cutbacks": 0, "iterations": 120}),
     "pipe-rough": (
         "pipe",
         "--rough --free",
@@ -548,6 +549,7 @@ def test_numbers(case, capfd):
         assert numbers["error_syy"] > 0.95 / 32
 
 
+@pytest.mark.slow
 def test_a_crack_in_shear_is_that_of_stock_dolfinx(capfd):
     """Force and energies of each step, to beyond the peak, and where the crack is."""
     small = "--case shear --model AT2 --length 0.16 --body free --steps 9 --reach 0.0108 --json"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import breaks, error_of_a_term, outcome, same_run
-from marks import thinned
+from marks import slow, thinned
 from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
 
@@ -126,7 +126,7 @@ def on_a_mat(speed, friction=0.0, cell=TRIANGLE, static=True, sideways=0.0, **op
     return problem, touch
 
 
-@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
+@pytest.mark.parametrize("scheme", [*slow("midpoint"), "conserving"])
 def test_a_block_falls_on_a_mat_without_inertia(scheme):
     # What the block loses of its momentum, the mat's floor has; both halves of the contact count.
     problem, _ = on_a_mat(0.3, scheme=scheme)
@@ -359,8 +359,8 @@ def test_a_run_that_is_interrupted_leaves_everything_as_it_was():
     ("scheme", "law", "passes"),
     [
         ("conserving", "penalty", 2),
-        ("midpoint", "penalty", 1),
-        ("euler", "penalty", 2),
+        pytest.param("midpoint", "penalty", 1, marks=pytest.mark.slow),
+        pytest.param("euler", "penalty", 2, marks=pytest.mark.slow),
         ("euler", "nitsche", 2),
     ],
 )

@@ -33,7 +33,11 @@ from mpm_dolfinx.meshes.redistribution import Redistribution
 
 
 @pytest.mark.parametrize(
-    ("friction", "angle", "cell"), [(0.3, 0.0, QUADRILATERAL), (0.5, 20.0, TRIANGLE)]
+    ("friction", "angle", "cell"),
+    [
+        pytest.param(0.3, 0.0, QUADRILATERAL, marks=pytest.mark.slow),
+        (0.5, 20.0, TRIANGLE),
+    ],
 )
 def test_a_block_sticks_up_to_the_angle_of_friction(friction, angle, cell):
     problem, ground, force = on_plane(friction, cell, angle)

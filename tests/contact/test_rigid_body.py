@@ -145,7 +145,7 @@ def test_a_body_falls_and_spins_as_nothing_touches_it():
         found.append(stone.placed().distance)
         angle = stone.angle
     # Euler's equations by Runge and Kutta.
-    w, Q, n = start.copy(), np.eye(3), 1000
+    w, Q, n = start.copy(), np.eye(3), 200
 
     def rates(w, Q):
         W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])

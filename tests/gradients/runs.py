@@ -254,7 +254,7 @@ def looked(scene):
     return {name: np.array(look()) for name, look in scene.looks.items()}
 
 
-def check(make, values, names=None, steps=5, change=2e-6, run=None):
+def check(make, values, names=None, steps=3, change=2e-6, run=None):
     """Compare the derivatives of all looks by some numbers with differences of whole runs.
 
     Differences are relative to a derivative, or to a tenth of what is looked at by a relative

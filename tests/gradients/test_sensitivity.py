@@ -20,7 +20,7 @@ from gradients.runs import (
     von_mises,
 )
 from laws import in_python
-from marks import all_but
+from marks import all_but, slow
 from scenes import HEXAHEDRON, TRIANGLE, WORLD, in_order
 
 from dolfinx import fem
@@ -137,7 +137,7 @@ def test_each_way_to_run(run):
     check(lambda **v: Loaded(**v), LOADS, ["young", "moved", "stress"], change=1e-5, run=RUNS[run])
 
 
-@pytest.mark.parametrize("f_bar", ["patch", "domain"])
+@pytest.mark.parametrize("f_bar", ["patch", *slow("domain")])
 def test_an_initial_stress_that_averages_see(f_bar):
     check(lambda **v: Loaded(f_bar=f_bar, **v), LOADS, ["young", "stress"], change=1e-5)
 

@@ -119,19 +119,20 @@ def trial_strains(count, seed):
 
 @pytest.mark.parametrize("law", PYRAMIDS)
 def test_principal_return_against_all_active_sets(law):
-    material, trial = LAWS[law], trial_strains(400, 0)
-    strain = np.zeros((400, 6))
+    count = 150
+    material, trial = LAWS[law], trial_strains(count, 0)
+    strain = np.zeros((count, 6))
     strain[:, :3] = trial
-    answer = material.integrate(strain, {"plastic_strain": np.zeros(400)}, False)
+    answer = material.integrate(strain, {"plastic_strain": np.zeros(count)}, False)
     seen = set()
-    for k in range(400):
+    for k in range(count):
         expected, active = returned_by_active_sets(material, trial[k])
         np.testing.assert_allclose(answer.stress[k, :3], expected, atol=1e-8)
         seen.add(active)
     friction = material.parameters["friction_angle"] or "tension_cutoff" in material.parameters
     assert seen >= ({0, 1, 2, 3} if friction else {0, 1, 2})
     if law.startswith("no cohesion"):
-        assert (np.abs(answer.stress).max(axis=1) < 1e-9).sum() > 50
+        assert (np.abs(answer.stress).max(axis=1) < 1e-9).sum() > 20
 
 
 def integrated(law, strain, tangent=False):
@@ -177,7 +178,7 @@ def test_tangents_at_plane_edges_and_apex(law, region, m):
 @pytest.mark.parametrize("law", LAWS)
 def test_a_thousand_random_paths(law, dim):
     material = LAWS[law]
-    assert check_tangent(material, dim, strain=2e-2, points=1000, steps=2) < 1e-6
+    assert check_tangent(material, dim, strain=2e-2, points=250, steps=2) < 1e-6
     state = material.initial_state(1000, dim)
     scale = max(material.parameters["cohesion"], 1.0)
     axes = (1.0, 2.0, -1.0) if dim == 3 else (0.0, 0.0, 1.0)

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Plastic laws whose flow takes time, against closed forms and the law of Perzyna."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from laws import assert_as_in_python, in_python
@@ -52,6 +54,8 @@ LAWS = {
     "by point": VonMises(1e3 * SPREAD, 0.3, rho_y=2.0 * SPREAD),
     "one's own": Rounded(),
 }
+#: Whose derivatives in space cost a second.
+COSTLY = ("averaged", "one's own")
 COMPILED = [name for name in LAWS if name not in ("small strain", "one's own")]
 
 
@@ -59,8 +63,14 @@ def taking(time, name, duration):
     return LAWS[name].with_relaxation(time).in_time(duration)
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(
+    ("name", "dim"),
+    [
+        *product([name for name in LAWS if name not in COSTLY], [2, 3]),
+        *((name, 2) for name in COSTLY),
+        *(pytest.param(name, 3, marks=pytest.mark.slow) for name in COSTLY),
+    ],
+)
 def test_the_tangent_is_the_derivative(name, dim):
     law = taking(TIME, name, 0.3)
     assert check_tangent(law, dim, strain=0.05) < 1e-7

@@ -7,6 +7,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 import scenes
+from marks import slow
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE
 
 import ufl
@@ -106,6 +107,6 @@ def test_the_constant_of_degree_1(offsets):
 
 
 @pytest.mark.parametrize("cell", [TETRAHEDRON, HEXAHEDRON], ids=scenes.name)
-@pytest.mark.parametrize("offset", [0.1, 0.999])
+@pytest.mark.parametrize("offset", [*slow(0.1), 0.999])
 def test_the_constant_in_space(cell, offset):
     assert inf_sup(cell, 2, offset) >= 0.4

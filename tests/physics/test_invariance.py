@@ -770,7 +770,6 @@ QUICK = (
     "mohr coulomb",
     "a floor",
     "adaptivity",
-    "quasi-static beside, midpoint",
 )
 
 

@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 from compare import EXACT, raises
+from marks import slow, thinned
 from obstacles import wall
 from own_schemes import BDF2, Theta
 from posed import posed
@@ -44,7 +45,7 @@ def change_of_balance(problem):
     return np.ptp(balances) / problem.history.energies[0].kinetic
 
 
-@pytest.mark.parametrize("uneven", [False, True])
+@pytest.mark.parametrize("uneven", [*slow(False), True])
 def test_bdf2_is_of_second_order_and_its_account_closes(uneven):
     errors = []
     for steps in (36, 72):
@@ -102,9 +103,18 @@ def require_same(one, other, tolerance):
         np.testing.assert_allclose(values, expected, rtol=0.0, atol=tolerance * size)
 
 
-@pytest.mark.parametrize("options", [{}, {"f_bar": "patch"}, {"mixed": "stabilised pressure"}])
-@pytest.mark.parametrize(("share", "known"), [(0.5, "midpoint"), (1.0, "euler"), (0.6, None)])
-def test_a_family_of_schemes_has_midpoint_and_euler_at_its_ends(share, known, options):
+@pytest.mark.parametrize(
+    ("options", "share", "known"),
+    thinned(
+        4,
+        [
+            (options, *scheme)
+            for options in ({"f_bar": "patch"}, {}, {"mixed": "stabilised pressure"})
+            for scheme in ((0.5, "midpoint"), (1.0, "euler"), (0.6, None))
+        ],
+    ),
+)
+def test_a_family_of_schemes_has_midpoint_and_euler_at_its_ends(options, share, known):
     found = bouncing(Theta(share), rayleigh=(0.1, 1e-3), **options)
     found.solve(time=0.3, dt=0.03)
     contact = [energy.internal for energy in found.history.energies]

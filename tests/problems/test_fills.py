@@ -5,11 +5,13 @@
 import warnings
 
 import pytest
+from marks import thinned
 from posed import posed
 from scenes import QUADRILATERAL, WORLD, at, box, fix, vectors
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
+from mpm_dolfinx.stepping import control
 
 GRAVITY = (0.0, -10.0)
 
@@ -54,8 +56,9 @@ def test_what_a_prediction_is_too_far_from_is_found(lifts, seconds, solves):
     assert problem.history.total_iterations <= solves
 
 
-def test_a_node_that_is_hardly_held_is_named():
+def test_a_node_that_is_hardly_held_is_named(monkeypatch):
     """The toe of a lift hangs on a node of weight 2e-7, as it is a row of cells too high."""
+    monkeypatch.setattr(control, "MOST_HALVINGS", 3)  # no smaller step helps
     cause = "the background's node near (7.0, 8.0) is held by next to nothing (a weight of"
     try:
         problem = fill(4, 1, stabilisation=None)
@@ -74,7 +77,8 @@ def test_a_node_that_is_hardly_held_is_named():
 
 
 @pytest.mark.parametrize(
-    ("lifts", "rows", "cutoff"), [(4, 1, None), (4, 1, 0.0), (4, 2, None), (3, 1, None)]
+    ("lifts", "rows", "cutoff"),
+    [*thinned(2, [(4, 1, None), (4, 1, 0.0), (4, 2, None), (3, 1, None)])],
 )
 def test_lifts_are_built_by_default(lifts, rows, cutoff):
     """What next to nothing holds follows the cell below: none stops at a toe that is let loose."""

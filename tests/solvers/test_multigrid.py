@@ -178,7 +178,7 @@ def test_a_saddle_point_in_space_whose_body_may_swell(monkeypatch):
 def test_water_in_the_pores():
     results = []
     for name in ("direct", "multigrid"):
-        n = 12
+        n = 8
         grid = scenes.box([0.0, 0.0], [1.5, 1.5], [3 * n // 2] * 2, QUADRILATERAL)
         shape = scenes.box([0.0, 0.01], [1.0, 1.01], [2 * n] * 2, QUADRILATERAL)
         body = mpm.Particles(shape, scenes.vectors(grid, 2), degree=2, quadrature_degree=4)

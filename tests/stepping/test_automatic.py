@@ -238,7 +238,7 @@ def pressed(law=None):
 
 def test_errors_of_contact_from_the_first_step_on_fall_with_the_tolerance():
     ends = []
-    for count in (50, 100):
+    for count in (25, 50):
         problem, path, _ = pressed()
         problem.solve(count, update=path)
         ends.append(nodal(problem))
@@ -268,7 +268,7 @@ def test_steps_are_driven_where_an_obstacle_moves_and_points_yield():
     assert not told_in_a_run(problem, lambda t: disc.move((0.0, -0.1)), disc)  # it rests
     for law in (None, Hencky(500.0, 0.3)):
         problem, path, disc = pressed(law)
-        judged.append(len(problem.solve("auto", tolerance=0.02, update=path).steps))
+        judged.append(len(problem.solve("auto", tolerance=0.04, update=path).steps))
     assert judged[1] < 0.5 * judged[0]  # where nothing yields the motion so far counts
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import raises
+from marks import slow
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, at
 
 import mpm_dolfinx as mpm
@@ -67,7 +68,7 @@ def share_free(own):
     return float(chosen.mean())
 
 
-@pytest.mark.parametrize("cell", [QUADRILATERAL, TRIANGLE, HEXAHEDRON], ids=str)
+@pytest.mark.parametrize("cell", [QUADRILATERAL, TRIANGLE, *slow(HEXAHEDRON)], ids=str)
 def test_a_run_goes_on_where_finite_elements_end(cell):
     problem, own = column("elements", cell)
     with suppress(mpm.MPMError):

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """The estimated error of steps in time, beside exact motions and much shorter steps."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from obstacles import wall
@@ -88,8 +90,13 @@ def bar(scheme):
     )
 
 
-@pytest.mark.parametrize("uneven", [False, True])
-@pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler", BDF2()])
+@pytest.mark.parametrize(
+    ("scheme", "uneven"),
+    [
+        *product(["midpoint", "conserving", BDF2()], [False, True]),
+        *(pytest.param("euler", False, marks=pytest.mark.slow), ("euler", True)),
+    ],
+)
 def test_what_a_vibration_has_lost_is_what_is_estimated(scheme, uneven):
     steps = 200 if scheme == "euler" else 30
     problem, time, errors = bar(scheme), 3.0, []
@@ -133,10 +140,10 @@ def thrown(kind, **options):
     [
         ("rigid", "midpoint"),
         ("plastic", "euler"),
-        ("plastic", "conserving"),
+        pytest.param("plastic", "conserving", marks=pytest.mark.slow),
         ("pair", "conserving"),
         ("background", "euler"),
-        ("body", "midpoint"),
+        pytest.param("body", "midpoint", marks=pytest.mark.slow),
     ],
 )
 def test_an_impact_is_as_uncertain_as_is_estimated(kind, scheme):

@@ -216,6 +216,7 @@ def plate(tags=None, unit=1.0, **given):
     return mpm.QuasiStaticProblem(made, supports=[top, bottom]), top
 
 
+@pytest.mark.slow
 @pytest.mark.skip_in_parallel  # hundreds of turns, in each of which ranks wait for each other
 def test_a_plate_breaks():
     problem, top = plate()
@@ -247,7 +248,8 @@ def bar(law, carried=False):
 
 
 @pytest.mark.parametrize(
-    ("scheme", "carried", "dt"), [("midpoint", False, 0.01), ("euler", True, 0.02)]
+    ("scheme", "carried", "dt"),
+    [("midpoint", False, 0.01), pytest.param("euler", True, 0.02, marks=pytest.mark.slow)],
 )
 def test_pieces_fly_on_and_keep_their_momentum(scheme, carried, dt):
     """A bar that is torn as it flies: nothing but its speed of stretching ends in the crack."""
