@@ -20,7 +20,7 @@ from .._core import loops
 from ..meshes.cells import disconnected_mesh, input_cell_index
 from ..tolerances import BLOCK, EQUAL, LAST_PLACES, NEGLIGIBLE
 
-__all__ = ["CellTable", "Cells", "cell_volumes"]
+__all__ = ["CellTable", "Cells"]
 
 
 class CellTable(NamedTuple):
@@ -320,16 +320,3 @@ def _solve(matrix: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[
     determinant = np.einsum("pi,pi->p", u, vw)
     cofactors = np.stack([np.einsum("pi,pi->p", k, vector) for k in numerators], axis=1)
     return np.asarray(cofactors / determinant[:, None])
-
-
-def cell_volumes(background: mesh.Mesh) -> NDArray[np.float64]:
-    """Return the volumes of the cells that this rank owns, shape ``(c,)``; areas in the plane."""
-    cell, gdim = background.basix_cell(), background.geometry.dim
-    degree = _compat.geometry_degree(background)
-    element = basix.ufl.element("Lagrange", cell.name, degree).basix_element
-    points, weights = basix.make_quadrature(cell, gdim * degree)
-    slopes = element.tabulate(1, points)[1:, :, :, 0]
-    count = background.topology.index_map(background.topology.dim).size_local
-    x = background.geometry.x[_compat.geometry_dofmap(background)[:count], :gdim]
-    jacobian = np.einsum("jqk,nki->nqij", slopes, x)
-    return np.asarray(np.abs(np.linalg.det(jacobian)) @ weights)

@@ -15,7 +15,7 @@ import basix.ufl
 from dolfinx import fem
 
 from .. import _compat
-from .cells import cell_volumes
+from ..meshes.quadrature import cell_volumes
 
 __all__ = ["CellPairs"]
 

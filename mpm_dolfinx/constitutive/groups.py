@@ -20,8 +20,8 @@ import basix
 from dolfinx import fem
 
 from ..background.basis import BackgroundBasis
-from ..background.cells import cell_volumes
 from ..background.grids import cell_lines, coarser
+from ..meshes.quadrature import cell_volumes
 from ..particles.particles import Particles
 from ..tolerances import HALF_DIGITS
 

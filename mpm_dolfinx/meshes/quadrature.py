@@ -18,7 +18,9 @@ from ..tolerances import BLOCK
 
 __all__ = [
     "DomainQuadrature",
+    "cell_volumes",
     "default_degree",
+    "determinant",
     "exact_degree",
     "means_around_axis",
     "nodal_forces",
@@ -93,10 +95,10 @@ class DomainQuadrature:
         points, weights = quadrature_rule(body.basix_cell(), degree)
         nodes, slopes = _geometry(body, points)
         gdim = nodes.shape[2]
-        jacobian = np.einsum("jqk,nki->nqij", slopes, nodes)
+        jacobian = _jacobians(nodes, slopes)
         table = shape_functions.tabulate(1, points)[:, :, :, 0]
         self.shapes: NDArray[np.float64] = table[0]
-        size = np.abs(np.linalg.det(jacobian))
+        size = np.abs(determinant(jacobian))
         span = np.ptp(nodes, axis=1).max(axis=1, initial=0.0) ** gdim
         self.flat: NDArray[np.bool_] = ~(size > 1e-12 * span[:, None]).all(axis=1)
         jacobian[self.flat] = np.eye(gdim)
@@ -150,11 +152,20 @@ def volumes_and_averages(
     volumes, averages = np.empty(len(nodes)), np.empty((len(nodes), shapes.shape[1]))
     for start in range(0, len(nodes), BLOCK):  # the Jacobians are many times the size of a body
         part = slice(start, start + BLOCK)
-        jacobian = np.einsum("jqk,nki->nqij", slopes, nodes[part])
-        sizes = weights * np.abs(np.linalg.det(jacobian))
+        sizes = weights * np.abs(determinant(_jacobians(nodes[part], slopes)))
         volumes[part] = sizes.sum(axis=1)
         averages[part] = sizes @ shapes / volumes[part, None]
     return volumes, averages
+
+
+def cell_volumes(domain: mesh.Mesh) -> NDArray[np.float64]:
+    """Return the volumes of the cells that this rank owns, shape ``(c,)``; areas in the plane."""
+    degree = domain.geometry.dim * _compat.geometry_degree(domain)
+    points, weights = quadrature_rule(domain.basix_cell(), degree)
+    nodes, slopes = _geometry(domain, points)
+    blocks = np.split(nodes, range(BLOCK, len(nodes), BLOCK))
+    sizes = [np.abs(determinant(_jacobians(block, slopes))) @ weights for block in blocks]
+    return np.concatenate(sizes)
 
 
 def means_around_axis(rule: DomainQuadrature, domains: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -191,6 +202,13 @@ def _geometry(
     degree = _compat.geometry_degree(body)
     element = basix.ufl.element("Lagrange", cell.name, degree).basix_element
     return nodes, element.tabulate(1, points)[1:, :, :, 0]
+
+
+def _jacobians(nodes: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``dx/dX`` at reference points, ``(n, nq, gdim, gdim)``; see :func:`_geometry`."""
+    (tdim, nq, k), (n, _, gdim) = slopes.shape, nodes.shape
+    product = slopes.reshape(-1, k) @ nodes.transpose(1, 0, 2).reshape(k, -1)
+    return product.reshape(tdim, nq, n, gdim).transpose(2, 1, 3, 0)
 
 
 def nodal_forces(
@@ -241,8 +259,13 @@ def with_hoop(
 
 def volume_ratio(gradient: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return ``det(I + H)`` of displacement gradients H, shape ``(..., dim, dim)``."""
-    H, dim = gradient, gradient.shape[-1]
-    diagonal = [1.0 + H[..., i, i] for i in range(dim)]
+    return determinant(gradient, 1.0)
+
+
+def determinant(matrix: NDArray[np.float64], shift: float = 0.0) -> NDArray[np.float64]:
+    """Return ``det(shift I + H)`` of matrices H, shape ``(..., dim, dim)`` with dim 2 or 3."""
+    H, dim = matrix, matrix.shape[-1]
+    diagonal = [shift + H[..., i, i] for i in range(dim)]
     with np.errstate(invalid="ignore", over="ignore"):
         if dim == 2:
             return np.asarray(diagonal[0] * diagonal[1] - H[..., 0, 1] * H[..., 1, 0])

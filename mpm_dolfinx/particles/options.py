@@ -22,7 +22,7 @@ from ..meshes.boxes import BOX_CELLS
 from ..meshes.cells import cell_vertices, input_cell_index
 from ..meshes.jacobian_bound import JacobianBound
 from ..meshes.order import gmsh_order
-from ..meshes.quadrature import default_degree
+from ..meshes.quadrature import default_degree, determinant
 from ..parallel.exchange import swap
 from ..parallel.given import require_whole
 from ..reals import is_one_of
@@ -291,7 +291,7 @@ def _shapes(
     ends = [int(np.abs(reference - e).sum(axis=1).argmin()) for e in np.eye(gdim)]
     origin = nodes[:, :1]
     axes = nodes[:, ends] - origin
-    volume = np.linalg.det(axes)
+    volume = determinant(axes)
     straight = np.einsum("ka,nai->nki", reference, axes) + origin
     slack = 1e-10 * np.ptp(nodes, axis=1).max(axis=1, initial=0.0)
     bent = np.flatnonzero(np.abs(nodes - straight).max(axis=(1, 2), initial=0.0) > slack)

@@ -14,7 +14,7 @@ import ufl
 from dolfinx import fem
 
 from ..errors import MPMError, agree
-from ..meshes.quadrature import means_around_axis
+from ..meshes.quadrature import determinant, means_around_axis
 from ..tolerances import SMALL
 from .geometry import Geometry
 from .means import MeansInUFL
@@ -116,7 +116,7 @@ class Undeformed:
             return
         before = np.eye(self.geometry.gdim) + self.reference.gradient
         np.matmul(plain.gradients, before, out=rule.gradients)
-        np.divide(plain.weights, np.linalg.det(before), out=rule.weights)
+        np.divide(plain.weights, determinant(before), out=rule.weights)
 
     @property
     def domains(self) -> Array:
