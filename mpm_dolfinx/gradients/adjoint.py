@@ -15,17 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ufl
-from dolfinx import fem, la
+from dolfinx import fem
 from ufl.algorithms.analysis import extract_coefficients
 
-from .. import _compat
 from ..constitutive.moduli import undeformed_tangent
 from ..errors import MPMError, agree
-from ..materials.base import Material, State
+from ..materials.base import State
 from ..parallel.boundary import collective, of_user
-from ..parallel.compilation import compiled_form
 from ..parallel.given import require_same
-from ..particles.particles import Particles
 from ..problems.quasistatic import QuasiStaticProblem
 from ..problems.through_time import TimeProblem
 from ..reals import as_reals
@@ -33,8 +30,8 @@ from ..stepping.trial import Trial
 from ..tolerances import DIFFERENCE
 from .backward import Backward, Record, Weights, copied, no_weights
 from .laws import Laws
+from .many import Many, assembled
 from .nearby import varying
-from .parameters import Parameter, as_parameter, largest
 from .sensitivity import require_followed
 
 __all__ = ["Adjoint"]
@@ -51,7 +48,7 @@ class _First:
     """Effects of a parameter before the first step, at the points and cells of each body.
 
     Attributes:
-        states: Derivatives of what materials keep, by the amount.
+        states: Derivatives of what materials keep, by the amount; what has none is left out.
         stiffness: Of that of supports, in each cell.
         tangent: Of ``W C_iJiJ`` of undeformed points, shape ``(n nq, gdim, gdim)``.
         modulus: Of the modulus of F-bar, in each cell, or ``None``.
@@ -61,82 +58,6 @@ class _First:
     stiffness: list[list[Array]]
     tangent: list[Array]
     modulus: list[Array | None]
-
-
-class _Many:
-    """A parameter, all values of which change by themselves.
-
-    Args:
-        given: As the user names it.
-        problem: The problem.
-    """
-
-    def __init__(self, given: Any, problem: QuasiStaticProblem) -> None:
-        self._thing, whole = given, True
-        if isinstance(given, tuple) and len(given) == 2:
-            whole = isinstance(given[0], Material)
-            self._thing = given[0].parameters.get(str(given[1])) if whole else given[0]
-        function = whole and isinstance(self._thing, fem.Function)
-        self.function: fem.Function | None = self._thing if function else None
-        self._sizes: Array = np.ones(1)
-        if self.function is not None:
-            values = np.abs(self.function.x.array)
-            size = largest(values, problem)
-            if size == 0.0:
-                raise MPMError(f"'{self.function.name}' is zero, which says nothing of its size.")
-            if not np.isfinite(size):
-                raise MPMError(f"'{self.function.name}' must be finite to differentiate by it.")
-            self._sizes = np.where(values > 1e-3 * size, values, size)
-            given = (self.function, self._sizes)
-        self.parameter: Parameter = as_parameter(given, problem, None)
-        if isinstance(self._thing, fem.Constant | fem.Function) and any(
-            _compat.holds(bc, self._thing) for bc in problem.bcs
-        ):
-            raise MPMError("An Adjoint does not differentiate by Dirichlet values yet.")
-        self.total: Array = np.zeros(self._sizes.shape if self.function is not None else ())
-        self._problem = problem
-
-    def zero(self) -> None:
-        """Forget what was added."""
-        self.total = np.zeros(self.total.shape)
-
-    def add_of_points(self, body: Particles, values: Array) -> None:
-        """Add derivatives at the points of a body, by the amount, shape ``(n nq,)``."""
-        self.add_of_cells(body, values.reshape(body.num_local, -1).sum(axis=1))
-
-    def add_of_cells(self, body: Particles, values: Array) -> None:
-        """Add derivatives in the owned cells of a body, by the amount."""
-        if self.function is None:
-            self.total = self.total + values.sum()
-        elif self.function.function_space.mesh is body.mesh:
-            dofs = self.function.function_space.dofmap.list[: body.num_local, 0]
-            self.total[dofs] += values / self._sizes[dofs]
-
-    def is_in(self, form: ufl.Form) -> bool:
-        """Return whether a form has it in itself."""
-        return any(one is self._thing for one in (*form.coefficients(), *form.constants()))
-
-    def add_of_form(self, form: ufl.Form) -> None:
-        """Add derivatives of a form by what it has of this in itself (collective)."""
-        if self.function is not None:
-            self.total += _assembled(ufl.derivative(form, self.function))
-            return
-        compiled, sides = compiled_form(form), []
-        for sign in (1.0, -1.0):
-            self.parameter.shift(sign * self.parameter.change)
-            sides.append(np.asarray(fem.assemble_scalar(compiled)))
-        self.parameter.shift(0.0)
-        self.total = self.total + self.parameter.slope(*sides)
-
-    def result(self) -> Array:
-        """Return the sum, over all ranks (collective)."""
-        if self.function is None:
-            comm: MPI.Comm = self._problem.bodies[0].mesh.comm
-            return np.asarray(comm.allreduce(float(self.total)))
-        whole = fem.Function(self.function.function_space)
-        whole.x.array[:] = self.total
-        whole.x.scatter_forward()
-        return np.asarray(whole.x.array)
 
 
 class Adjoint:
@@ -173,7 +94,7 @@ class Adjoint:
         require_followed(problem, "An Adjoint")
         _require_plain(problem)
         self.problem = problem
-        self._many = [_Many(given, problem) for given in parameters]
+        self._many = [Many(given, problem) for given in parameters]
         if not self._many:
             raise MPMError("Name a parameter to differentiate by.")
         self._first = [self._at_first(one) for one in self._many]
@@ -248,7 +169,7 @@ class Adjoint:
 
     # -- Before the first step ------------------------------------------------------------------
 
-    def _at_first(self, one: _Many) -> _First:
+    def _at_first(self, one: Many) -> _First:
         """Return the effects of a parameter before the first step (collective)."""
         problem, parameter = self.problem, one.parameter
         sides = []
@@ -262,7 +183,7 @@ class Adjoint:
         after, before = sides
         return _First(
             [
-                [parameter.rate(*pair) for pair in zip(*own, strict=True)]
+                [_changing(parameter.rate(*pair)) for pair in zip(*own, strict=True)]
                 for own in zip(after.states, before.states, strict=True)
             ],
             [
@@ -369,19 +290,31 @@ class Adjoint:
         for number, record in self._from_the_end(back):
             back.go_to(record, data)
             self._add_functional(look(number), weights)
-            moved, backgrounds, laws = back.step(record, weights)
-            self._add_penalties(backgrounds, penalised)
-            for own, body, motion in zip(stiffened, problem.bodies, moved, strict=True):
-                for total, support in zip(own, problem.setup.supports_of(body), strict=True):
-                    total -= support.work_by_stiffness(motion)
-            for one in self._many:
-                if one.parameter.outside:
-                    self._add_loads(one, moved)
-            for place, (law, motion) in enumerate(zip(laws, moved, strict=True)):
-                self._add_law(place, law, motion, weights)
+            self._go_through(back, record, weights, penalised, stiffened)
         for one, first in zip(self._many, self._first, strict=True):
             if one.parameter.of_law:
                 self._add_first(one, first, weights, penalised, stiffened)
+
+    def _go_through(
+        self,
+        back: Backward,
+        record: Record,
+        weights: Weights,
+        penalised: dict[int, Array],
+        stiffened: Sequence[Sequence[Array]],
+    ) -> None:
+        """Go through one step backward; all that is large is forgotten after it."""
+        problem = self.problem
+        moved, backgrounds, laws = back.step(record, weights)
+        self._add_penalties(backgrounds, penalised)
+        for own, body, motion in zip(stiffened, problem.bodies, moved, strict=True):
+            for total, support in zip(own, problem.setup.supports_of(body), strict=True):
+                total -= support.work_by_stiffness(motion)
+        for one in self._many:
+            if one.parameter.outside:
+                self._add_loads(one, moved)
+        for place, (law, motion) in enumerate(zip(laws, moved, strict=True)):
+            self._add_law(place, law, motion, weights)
 
     def _from_the_end(self, back: Backward) -> Iterator[tuple[int, Record]]:
         """Yield the steps from the last one, with their numbers and what materials kept."""
@@ -408,7 +341,7 @@ class Adjoint:
         else:
             weights.states[place] = [{k: 0.0 * v for k, v in own.items()} for own in states]
 
-    def _add_loads(self, one: _Many, moved: Sequence[fem.Function]) -> None:
+    def _add_loads(self, one: Many, moved: Sequence[fem.Function]) -> None:
         """Add what forces depend on besides laws."""
         problem, parameter = self.problem, one.parameter
         if one.function is not None:
@@ -444,7 +377,7 @@ class Adjoint:
 
     def _add_first(
         self,
-        one: _Many,
+        one: Many,
         first: _First,
         weights: Weights,
         penalised: Mapping[int, Array],
@@ -457,8 +390,8 @@ class Adjoint:
             for own, rates, part in zip(
                 weights.states[place], first.states[place], points.laws.governed, strict=True
             ):
-                for name, values in own.items():
-                    product = (values * rates[name]).reshape(len(part.points), -1)
+                for name, rate in rates.items():
+                    product = (own[name] * rate).reshape(len(part.points), -1)
                     found[part.points] += product.sum(axis=1)
             one.add_of_points(body, found)
             for total, slope in zip(stiffened[place], first.stiffness[place], strict=True):
@@ -558,19 +491,16 @@ class Adjoint:
             )
         for body, motion in zip(self.problem.bodies, weights.motion, strict=True):
             if any(one is body.displacement for one in held):
-                motion.x.array[:] += _assembled(ufl.derivative(form, body.displacement))
+                motion.x.array[:] += assembled(ufl.derivative(form, body.displacement))
                 motion.x.scatter_forward()
         for one in self._many:
             if one.is_in(form):
                 one.add_of_form(form)
 
 
-def _assembled(form: ufl.Form) -> Array:
-    """Return a linear form, assembled on the local dofs with those of other ranks (collective)."""
-    vector = fem.assemble_vector(compiled_form(form))
-    vector.scatter_reverse(la.InsertMode.add)
-    vector.scatter_forward()
-    return np.asarray(vector.array)
+def _changing(rates: State) -> State:
+    """Return the derivatives that are not zero."""
+    return {name: values for name, values in rates.items() if np.any(values)}
 
 
 def _require_plain(problem: Any) -> None:

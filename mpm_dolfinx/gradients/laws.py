@@ -130,7 +130,7 @@ class Laws:
                     parameter.shift(sign * parameter.change)
                     parameter.govern(points, sign * parameter.change)
                     sides.append(list(points.laws.governed))
-                rates = _number_rates(sides, parameter.change)
+                rates = _number_rates(sides, self._states, parameter.change)
                 pairs = zip(pulled, rates, strict=True)
                 return self._together([(own.numbers * rate).sum(axis=1) for own, rate in pairs])
 
@@ -285,19 +285,23 @@ def _compiled_laws(points: MaterialPoints) -> list[tuple[CompiledMaterial, NDArr
     return found if len(found) == len(points.laws.governed) else []
 
 
-def _number_rates(sides: Sequence[Sequence[Governed]], change: float) -> list[Array]:
+def _number_rates(
+    sides: Sequence[Sequence[Governed]], states: Sequence[State], change: float
+) -> list[Array]:
     """Return the derivatives of the numbers of compiled laws by a parameter.
 
     Args:
         sides: The materials with the parameter at its change, and at minus that.
+        states: What they go on from.
         change: The change.
 
     Returns:
         For each law, shape ``(n, k)`` or ``(1, k)``.
     """
     found = []
-    for pair in zip(*sides, strict=True):
-        a, b = (part.law.numbers() for part in pair if isinstance(part.law, CompiledMaterial))
+    for state, *pair in zip(states, *sides, strict=True):
+        laws = [part.law for part in pair if isinstance(part.law, CompiledMaterial)]
+        a, b = (law.numbers(state) for law in laws)
         gap = np.subtract(a, b, where=a != b, out=np.zeros_like(a))  # (some may be infinite)
         found.append((gap / (2.0 * change)).T)
     return found

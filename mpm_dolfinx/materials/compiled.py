@@ -155,10 +155,13 @@ class CompiledMaterial(StrainMaterial):
         """Whether there is :meth:`pull` of its updates."""
         return self._has_compiled_update() and self._return() == self._loop
 
-    def numbers(self) -> Array:
+    def numbers(self, state: State) -> Array:
         """Return the numbers of the compiled law, shape ``(k, n)``, or ``(k, 1)`` if all alike.
 
         The last is the share of a return that there is time for.
+
+        Args:
+            state: That from which the law goes on.
         """
         return np.stack(np.broadcast_arrays(*map(_values, (*self._constants(), self._share()))))
 
@@ -174,7 +177,7 @@ class CompiledMaterial(StrainMaterial):
             weights: Those by the new state.
         """
         taken = [np.empty_like(own) for own in self._in_order(first_piola, weights, state)]
-        taken.append(np.empty((len(first_piola), len(self.numbers()))))
+        taken.append(np.empty((len(first_piola), len(self.numbers(state)))))
         seen = self._in_order(first_piola, weights, state)
         given = [seen[0], np.array(weights["stress"]), seen[2], seen[3]]
         loops.pull(*self._step(displacement_gradient, state), taken, given)

@@ -11,8 +11,9 @@ from typing import Self, override
 import numpy as np
 from numpy.typing import NDArray
 
+from ..tolerances import DIFFERENCE
 from .base import Integration, Parameter, State, Update
-from .compiled import CompiledMaterial
+from .compiled import CompiledMaterial, Taken
 from .given_pressure import AtPressure
 from .plastic import PlasticMaterial
 
@@ -80,11 +81,27 @@ class SofteningMaterial(PlasticMaterial):
         """Return the last parameters of a compiled law that softens by an average."""
         return self.parameters["decay"], MIXTURE * self.parameters["average"], MIXTURE - 1.0
 
-    @property
     @override
-    def is_differentiable(self) -> bool:
-        # (the strength, which the compiled return is given, depends on the state)
-        return super().is_differentiable and not self.softens
+    def numbers(self, state: State) -> Array:
+        if self._softens_at_once():
+            return self.softened(state["plastic_strain"]).numbers(state)
+        return super().numbers(state)
+
+    @override
+    def pull(
+        self, displacement_gradient: Array, state: State, first_piola: Array, weights: State
+    ) -> Taken:
+        if not self._softens_at_once():
+            return super().pull(displacement_gradient, state, first_piola, weights)
+        strain = state["plastic_strain"]
+        law = self.softened(strain)
+        found = law.pull(displacement_gradient, state, first_piola, weights)
+        amount = DIFFERENCE / self.parameters["decay"]
+        sides = (self.softened(strain + change).numbers(state) for change in (amount, -amount))
+        after, before = sides
+        gap = np.subtract(after, before, where=after != before, out=np.zeros_like(after))
+        found.state["plastic_strain"] += (found.numbers * (gap / (2.0 * amount)).T).sum(axis=1)
+        return found
 
     @override
     def update(self, displacement_gradient: Array, state: State, tangent: bool = True) -> Update:
