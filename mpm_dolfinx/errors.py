@@ -66,6 +66,7 @@ class MPMError(RuntimeError):
         load: Load factor of the last converged step, or ``None`` before a run.
         dofs: Global dofs of V with the largest residual, where Newton's method failed.
         where: A place outside the background, where that is the trouble.
+        advice: What to do, where that is known where it is raised.
     """
 
     def __init__(
@@ -76,6 +77,7 @@ class MPMError(RuntimeError):
         self.load = load
         self.dofs: list[int] = []
         self.where: tuple[float, ...] | None = None
+        self.advice = ""
         names = name_particles(self.particles)
         super().__init__(self.message.replace("{particles}", names))
 
@@ -84,7 +86,7 @@ class MPMError(RuntimeError):
         return (
             type(self),
             (self.message, self.particles, self.load),
-            {"dofs": self.dofs, "where": self.where},
+            {"dofs": self.dofs, "where": self.where, "advice": self.advice},
         )
 
 
@@ -96,14 +98,21 @@ class DomainDistortionError(MPMError):
     """A particle domain is inverted or crosses itself."""
 
     @classmethod
-    def of(cls, how: str, which: Sequence[int] | NDArray[np.int64]) -> Self | None:
+    def of(
+        cls, how: str, which: Sequence[int] | NDArray[np.int64], advice: str = ""
+    ) -> Self | None:
         """Return an error about particles, if there are any.
 
         Args:
             how: What their domains do.
             which: Their global indices.
+            advice: What to do, besides smaller steps.
         """
-        return cls(f"The domains of {{particles}} {how}", which) if len(which) else None
+        if not len(which):
+            return None
+        error = cls(f"The domains of {{particles}} {how}", which)
+        error.advice = advice
+        return error
 
 
 class ConvergenceError(MPMError):
@@ -254,7 +263,7 @@ def _common[E: BaseException](place: MPI.Comm, error: E | None) -> E | None:
     if isinstance(first, MPMError):
         particles = {p for e in errors if type(e) is type(first) for p in e.particles}
         common = type(first)(first.message, particles, first.load)
-        common.dofs, common.where = first.dofs, first.where
+        common.dofs, common.where, common.advice = first.dofs, first.where, first.advice
         common.__cause__ = None if error is None else error.__cause__
     setattr(common, _AGREED, True)
     return cast(E, common)

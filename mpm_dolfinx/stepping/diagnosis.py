@@ -44,12 +44,10 @@ def improper(bodies: Sequence[Particles], materials: Sequence[MaterialPoints]) -
     """
     found: MPMError | None = None
     for body in bodies:
-        how = "cross themselves"
+        advice = ""
         if body.num_points == 1:
-            how += (
-                ", as one quadrature point lets them; Particles(..., quadrature_degree=2) does not"
-            )
-        found = found or DomainDistortionError.of(how, crossed(body))
+            advice = "take Particles(..., quadrature_degree=2), as one point lets them fold"
+        found = found or DomainDistortionError.of("cross themselves", crossed(body), advice)
     for points in materials:
         found = found or DomainDistortionError.of(*points.strain.beyond())
     return agreed(bodies[0].mesh.comm, found)
@@ -85,8 +83,8 @@ def placed(
         DomainDistortionError: "; take more steps, smaller loads or finer domains",
         ConvergenceError: "; take more steps, or look whether a limit load is reached",
     }.get(type(error), "")
-    if limit is not None:
-        advice = f"; {limit}"
+    if error.advice or limit is not None:
+        advice = f"; {error.advice or limit}"
     particles, text = error.particles, error.message.rstrip(".")
     dofs: list[int] = []
     lost = any([not np.isfinite(norm(field.force)) for field in reduced.fields])
