@@ -69,6 +69,21 @@ def test_penalty_is_the_jump_of_normal_derivatives(degree):
     assert np.isclose(x.dot(y), PENALTY * 3.0 * 2.0 / (2 * degree + 1), rtol=1e-10)
 
 
+def test_carried_nodes_are_counted_once_on_any_number_of_ranks():
+    """Whether there is a penalty hangs on nodes of V with weight over 36 nodes that are carried."""
+    V = scenes.vectors(scenes.box([-0.1, -0.1], [1.9, 1.9], [8, 8], QUADRILATERAL))
+    body = scenes.unit(8, QUADRILATERAL)
+    cells = mesh.locate_entities(body, 2, lambda x: x[0] < 0.51)
+    tags = mesh.meshtags(body, 2, cells, np.ones(len(cells), dtype=np.int32))
+    particles = mpm.Particles(body, V, free=(tags, 1))
+    touched = TouchedNodes(V, [particles.node_basis], [particles.W.dofmap.index_map.size_local])
+    most = WORLD.allreduce(len(touched.active)) / 36.0
+    for least, acts in ((most, True), (most * (1.0 + 1e-12), False)):
+        ghost = GhostPenalty([particles], least)
+        look(ghost, particles)
+        assert ghost.acts is acts
+
+
 def test_a_penalty_that_comes_later_does_not_depend_on_where_a_step_starts():
     """With degree 1 it comes where nodes enter cells; points may yield at the first guess then."""
     found = []
