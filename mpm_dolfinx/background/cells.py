@@ -23,18 +23,33 @@ from ..tolerances import BLOCK, EQUAL, LAST_PLACES, NEGLIGIBLE
 __all__ = ["CellTable", "Cells"]
 
 
+class Vertices:
+    """Geometry nodes of a mesh's cells, which are found where they are asked for.
+
+    Args:
+        x: Coordinates of nodes, shape ``(N, gdim)``.
+        corners: Nodes of the cells, shape ``(n, k)``.
+    """
+
+    def __init__(self, x: NDArray[np.float64], corners: NDArray[np.int32]) -> None:
+        self._x, self._corners = x, corners
+
+    def __getitem__(self, cells: slice | NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+        return np.asarray(self._x[self._corners[cells]])
+
+
 class CellTable(NamedTuple):
     """Background cells, of any rank.
 
     Attributes:
-        vertices: Their geometry nodes, shape ``(n, k, gdim)``.
+        vertices: Their geometry nodes, of shape ``(n, k, gdim)`` where it is indexed.
         nodes: Global nodes of V, shape ``(n, K)``.
         number: Input indices, shape ``(n,)``.
         home: Local numbers on the ranks that own them, shape ``(n,)``.
         rank: These ranks, shape ``(n,)``.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: NDArray[np.float64] | Vertices
     nodes: NDArray[np.int64]
     number: NDArray[np.int64]
     home: NDArray[np.integer[Any]]
@@ -48,7 +63,7 @@ class CellTable(NamedTuple):
         corners = _compat.geometry_dofmap(background)[:count]
         dofs = V.dofmap.list[:count]
         return cls(
-            background.geometry.x[corners][:, :, : background.geometry.dim],
+            Vertices(background.geometry.x[:, : background.geometry.dim], corners),
             V.dofmap.index_map.local_to_global(dofs.ravel()).reshape(dofs.shape),
             input_cell_index(background),
             np.arange(count, dtype=np.int32),
@@ -61,7 +76,8 @@ class CellTable(NamedTuple):
 
     def joined(self, other: CellTable) -> CellTable:
         """Return the cells of both tables, each once."""
-        both = CellTable._make(np.concatenate(pair) for pair in zip(self, other, strict=True))
+        pairs = zip(self, other, strict=True)
+        both = CellTable._make(np.concatenate([one[:], two[:]]) for one, two in pairs)
         return both.part(np.unique(both.number, return_index=True)[1])
 
 
@@ -76,7 +92,7 @@ class Cells:
     def __init__(self, background: mesh.Mesh, table: CellTable) -> None:
         self.vertices, self.nodes, self.index, self.home, self.rank = table
         self.gdim = background.geometry.dim
-        count = len(self.vertices)
+        vertices, count = table.vertices[:], len(table.nodes)
         self._background = background
         self._name = background.basix_cell()
         self.simplex = self._name in (basix.CellType.triangle, basix.CellType.tetrahedron)
@@ -85,38 +101,41 @@ class Cells:
         ).basix_element
         self.middle = basix.geometry(self._name).mean(axis=0)
         # Of coordinates: no small part of a cell that is tiny or far from the origin.
-        self.roundoff = 2.0 * LAST_PLACES * np.abs(self.vertices).max(initial=0.0)
+        self.roundoff = 2.0 * LAST_PLACES * np.abs(vertices).max(initial=0.0)
+        self._smallest = np.ptp(vertices, axis=1).max(axis=1, initial=0.0).min(initial=np.inf)
         self.affine = self._is_affine()
         every = np.arange(count)
         slopes = np.linalg.inv(self.jacobians(every, np.tile(self.middle, (count, 1))))
-        error = LAST_PLACES * np.abs(self.vertices).max(axis=(1, 2), initial=0.0)
+        error = LAST_PLACES * np.abs(vertices).max(axis=(1, 2), initial=0.0)
         #: Reference distance that is round-off of coordinates, which is much far from the origin.
         self.slack = error * np.abs(slopes).sum(axis=2).max(axis=1, initial=0.0)
         if self.affine:
             self._slopes = slopes
             self._centres = np.einsum(
-                "k,nki->ni", self.map.tabulate(0, self.middle[None])[0, 0, :, 0], self.vertices
+                "k,nki->ni", self.map.tabulate(0, self.middle[None])[0, 0, :, 0], vertices
             )
-        self.grid = None if self.simplex or not self.affine else RegularGrid.of(self.vertices)
+        self.grid = None if self.simplex or not self.affine else RegularGrid.of(vertices)
 
     @cached_property
     def tree(self) -> Any:
         """A tree of the cells' bounding boxes."""
-        size = np.ptp(self.vertices.reshape(-1, self.gdim), axis=0).max()
+        vertices = self.vertices[:]
+        size = np.ptp(vertices.reshape(-1, self.gdim), axis=0).max()
         domain = self._background
         if domain.comm.size > 1:
             degree = self.map.degree
-            domain = disconnected_mesh(MPI.COMM_SELF, self.vertices, self._name, degree=degree)
-        cells = np.arange(len(self.vertices), dtype=np.int32)
+            domain = disconnected_mesh(MPI.COMM_SELF, vertices, self._name, degree=degree)
+        cells = np.arange(len(vertices), dtype=np.int32)
         slack = max(1e2 * NEGLIGIBLE * size, self.roundoff)
         return geometry.bb_tree(domain, domain.topology.dim, padding=slack, entities=cells)
 
     def _is_affine(self) -> bool:
-        if len(self.vertices) == 0 or (self.simplex and self.map.degree == 1):
+        count = len(self.nodes)
+        if count == 0 or (self.simplex and self.map.degree == 1):
             return True
         corners = np.vstack([self.middle, self.middle + 0.37 / (1 + np.arange(self.gdim))])
         jacobians = self.jacobians(
-            np.arange(len(self.vertices)).repeat(2), np.tile(corners, (len(self.vertices), 1))
+            np.arange(count).repeat(2), np.tile(corners, (count, 1))
         ).reshape(-1, 2, self.gdim, self.gdim)
         change = np.abs(jacobians[:, 0] - jacobians[:, 1]).max(axis=(1, 2))
         slack = 1e-12 * np.abs(jacobians).max(axis=(1, 2, 3))
@@ -147,8 +166,7 @@ class Cells:
             return np.asarray(self.middle + np.einsum("nij,nj->ni", self._slopes[cells], gaps))
         reference = np.tile(self.middle, (len(points), 1))
         active = np.arange(len(points))
-        smallest = np.ptp(self.vertices, axis=1).max(axis=1).min(initial=np.inf)
-        floor = self.roundoff / smallest
+        floor = self.roundoff / self._smallest
         for _ in range(30):
             table = _compat.tabulated(self.map, 1, reference[active])
             corners = self.vertices[cells[active]]
@@ -201,7 +219,7 @@ class Cells:
             self._locate_in_grid(self.grid, points, cell, reference, violation)
         if violation.max(initial=0.0) <= NEGLIGIBLE:
             return cell, reference, violation
-        for start in range(0, n if len(self.vertices) else 0, BLOCK):
+        for start in range(0, n if len(self.nodes) else 0, BLOCK):
             block = np.arange(start, min(start + BLOCK, n))
             block = block[violation[block] > NEGLIGIBLE]
             block = block[np.isfinite(points[block]).all(axis=1)]

@@ -32,8 +32,9 @@ class Tiles:
     def __init__(self, comm: MPI.Comm, own: CellTable) -> None:
         self._comm = comm
         self._own = own
-        gdim = own.vertices.shape[2]
-        low, high = own.vertices.min(axis=1), own.vertices.max(axis=1)
+        vertices = own.vertices[:]
+        gdim = vertices.shape[2]
+        low, high = vertices.min(axis=1), vertices.max(axis=1)
         empty = np.full((1, gdim), np.inf)
         corner = np.append(low, empty, axis=0).min(axis=0)
         opposite = np.append(high, -empty, axis=0).max(axis=0)
@@ -77,7 +78,7 @@ class Tiles:
         told = [self._inside(q) for q in swap(self._comm, [asked[has] for has in of_rank])]
         whole = [np.column_stack([t.number, t.home, t.rank, t.nodes]) for t in told]
         numbers = np.concatenate(swap(self._comm, whole))
-        vertices = np.concatenate(swap(self._comm, [t.vertices for t in told]))
+        vertices = np.concatenate(swap(self._comm, [t.vertices[:] for t in told]))
         number, home, rank, nodes = np.split(numbers, [1, 2, 3], axis=1)
         where = (home[:, 0].astype(np.int32), rank[:, 0].astype(np.int32))
         self.cells = self.cells.joined(CellTable(vertices, nodes, number[:, 0], *where))
