@@ -13,6 +13,7 @@ from dolfinx import fem, mesh
 
 from ..meshes.quadrature import quadrature_rule, volume_ratio, with_hoop
 from ..parallel.boundary import Owned
+from ..tolerances import BLOCK
 from .deletion import Deletion
 from .undeformed import Undeformed, reach_behind_axis
 
@@ -183,7 +184,11 @@ class Domains(Owned):
 
     def inverted(self) -> NDArray[np.int64]:
         """Return global indices of domains with ``det F <= 0`` or not finite at a point."""
-        positive = volume_ratio(self.displacement_gradient()) > 0.0
+        gradient = self.displacement_gradient()
+        positive = np.empty(gradient.shape[:2], dtype=bool)
+        for start in range(0, len(gradient), BLOCK):
+            part = slice(start, start + BLOCK)
+            positive[part] = volume_ratio(gradient[part]) > 0.0
         if positive.all():
             return self.global_index[:0]
         return np.asarray(self.global_index[~positive.all(axis=1)])
