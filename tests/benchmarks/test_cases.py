@@ -17,7 +17,7 @@ import mpm_dolfinx as mpm
 
 CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 #: Programs that ``make test`` runs, and numbers that it leaves to ``make test-all``.
-SHORT = ("compaction", "column_free")
+SHORT = ("compaction",)
 LONG = {
     *("sand-damped", "sand-dilates", "notch", "retrogression"),
     *("cone", "cryer", "footing-weight", "wedge", "gradient-degree-2", "footing-friction"),
@@ -614,7 +614,11 @@ def test_column_goes_on_from_its_checkpoint(mpi_tmp_path, capfd, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "arguments"),
     [
-        pytest.param("compaction", "--elements 4 --steps 10", marks=pytest.mark.skip_in_parallel),
+        pytest.param(
+            "compaction",
+            "--elements 4 --steps 10",
+            marks=[pytest.mark.skip_in_parallel, pytest.mark.slow],
+        ),
         ("column_roller", "--elements 8 --steps 10"),
         ("column_free", "--cell 1 --steps 10 --g0 10e3"),
         pytest.param(

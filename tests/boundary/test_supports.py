@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import scenes
-from marks import slow
+from marks import slow, thinned
 from obstacles import wall
 from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD
@@ -67,8 +67,17 @@ def inclined_column(case, ne, angle, cell, material, comm=WORLD, **options):
     return problem, supports, Q, error
 
 
-@pytest.mark.parametrize("angle", [0, 30, *slow(77)])
-@pytest.mark.parametrize(("cell", "aligned"), [(QUADRILATERAL, 2.57e-3), (TRIANGLE, 6.16e-3)])
+@pytest.mark.parametrize(
+    ("angle", "cell", "aligned"),
+    thinned(
+        3,
+        [
+            (angle, *on)
+            for angle in (0, 30, 77)
+            for on in ((QUADRILATERAL, 2.57e-3), (TRIANGLE, 6.16e-3))
+        ],
+    ),
+)
 def test_column_on_an_inclined_roller(angle, cell, aligned):
     case = scenes.A
     problem, supports, Q, error = inclined_column(

@@ -75,7 +75,7 @@ def nudged(law):
 
 
 @pytest.mark.parametrize(("name", "way"), thinned(5, PAIRS))
-@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("half", [*slow(False), True])
 def test_an_equal_law_changes_nothing(name, way, half):
     law, options = LAWS[name], WAYS[way]
     if name == "clay":

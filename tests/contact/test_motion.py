@@ -55,7 +55,7 @@ def falling(shape, friction=0.0, comm=WORLD, turn=0.0, **options):
     [
         (contact.plane((0.0, 0.5), (0.1, 1.0)), 0.5),
         (contact.disc((0.4, 0.2), 0.3), 0.0),
-        (contact.box((0.2, 0.0), (0.6, 0.5), 0.1), 0.0),
+        pytest.param(contact.box((0.2, 0.0), (0.6, 0.5), 0.1), 0.0, marks=pytest.mark.slow),
     ],
     ids=["plane", "disc", "box"],
 )
@@ -250,7 +250,9 @@ def colliding(
     return problem, touch
 
 
-@pytest.mark.parametrize(("friction", "passes"), [(0.0, 2), (0.0, 1), (0.3, 2), (Worn(), 2)])
+@pytest.mark.parametrize(
+    ("friction", "passes"), thinned(3, [(0.0, 1), (0.0, 2), (0.3, 2), (Worn(), 2)])
+)
 def test_bodies_that_collide_keep_momentum_and_energy(friction, passes):
     problem, touch = colliding(friction, passes=passes)
     momentum, turning = problem.momentum, problem.angular_momentum
@@ -272,7 +274,7 @@ def test_bodies_that_collide_keep_momentum_and_energy(friction, passes):
     assert account(history) < 1e-9
 
 
-@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("passes", [1, *slow(2)])
 def test_a_corner_that_passes_the_other_gives_no_energy(passes):
     # Facets end there, and points come from the side; without an offset of their gaps they would
     # multiply the energy by 1.45.

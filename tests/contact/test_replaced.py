@@ -2,10 +2,13 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Contacts that come, go, change places and stand in for others: what each remembers is its own."""
 
+from itertools import product
+
 import numpy as np
 import pairs
 import pytest
 import scenes
+from marks import slow, thinned
 from posed import posed
 from scenes import QUADRILATERAL, WORLD, box
 
@@ -236,7 +239,10 @@ def test_an_equal_contact_in_its_place_changes_nothing(kind):
 
 @pytest.mark.parametrize(
     ("law", "passes", "swapped"),
-    [("penalty", 2, False), ("penalty", 2, True), ("penalty", 1, False), ("nitsche", 2, False)],
+    thinned(
+        2,
+        [("penalty", 2, True), ("penalty", 2, False), ("nitsche", 2, False), ("penalty", 1, False)],
+    ),
 )
 def test_an_equal_pair_in_its_place_changes_nothing(law, passes, swapped):
     found = []
@@ -257,8 +263,9 @@ def test_an_equal_pair_in_its_place_changes_nothing(law, passes, swapped):
         assert np.abs(one - two).max() < 1e-12 * np.abs(one).max()
 
 
-@pytest.mark.parametrize("law", ["penalty", "nitsche"])
-@pytest.mark.parametrize("split", [False, True])
+@pytest.mark.parametrize(
+    ("law", "split"), thinned(3, product(["penalty", "nitsche"], [False, True]))
+)
 def test_equals_of_two_contacts_in_their_places_change_nothing(law, split):
     """Also where one of them was made after the body was split, and has areas of its own."""
     found = []
@@ -292,7 +299,7 @@ def test_equals_of_two_contacts_in_their_places_change_nothing(law, split):
         assert np.abs(one - two).max() < 1e-12 * np.abs(one).max()
 
 
-@pytest.mark.parametrize("law", ["penalty", "nitsche"])
+@pytest.mark.parametrize("law", [*slow("penalty"), "nitsche"])
 def test_equals_of_two_pairs_in_their_places_change_nothing(law):
     """Each has facets of its own of the same bodies."""
     found = []

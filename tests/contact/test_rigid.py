@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
+from marks import thinned
 from obstacles import (
     CONFINED,
     POISSON,
@@ -315,7 +316,8 @@ def test_a_sphere_pressed_into_a_cube_and_turned():
 
 
 @pytest.mark.parametrize(
-    ("friction", "scheme"), [(0.2, "euler"), (0.6, "euler"), (0.2, "midpoint"), (0.6, "conserving")]
+    ("friction", "scheme"),
+    thinned(3, [(0.2, "euler"), (0.6, "euler"), (0.2, "midpoint"), (0.6, "conserving")]),
 )
 def test_a_block_slides_down_an_incline_or_stays(friction, scheme):
     t, normal = tilted(30.0)

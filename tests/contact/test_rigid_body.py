@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import breaks, error_of_a_term, outcome, raises, same_run
+from marks import slow, thinned
 from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
 
@@ -62,7 +63,9 @@ def energy(problem, ball):
     return e.kinetic + e.strain + ours + e.damping
 
 
-@pytest.mark.parametrize(("shape", "friction"), [("disc", 0.0), ("box", 0.0), ("box", 0.4)])
+@pytest.mark.parametrize(
+    ("shape", "friction"), thinned(2, [("disc", 0.0), ("box", 0.0), ("box", 0.4)])
+)
 def test_an_impact_keeps_energy_momentum_and_angular_momentum(shape, friction):
     problem, ball = thrown(shape, friction)
     momentum = problem.momentum + ball.momentum
@@ -100,7 +103,7 @@ def test_an_impact_on_metal_takes_what_yielding_takes(strength):
     assert np.mean(problem.history.iterations) < 5.0 and problem.history.cutbacks == 0
 
 
-@pytest.mark.parametrize("shape", ["disc", "box"])
+@pytest.mark.parametrize("shape", [*slow("disc"), "box"])
 def test_an_impact_at_the_coordinates_of_a_map_takes_the_same_steps(shape):
     found = []
     for origin in (0.0, 4e6):

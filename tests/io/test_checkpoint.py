@@ -11,6 +11,7 @@ import pytest
 import scenes
 from compare import EXACT, outcome, same_run
 from laws import Brittle
+from marks import slow
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD
 from stress import kills
 
@@ -56,7 +57,7 @@ def test_flowing_column(mpi_tmp_path):
     assert scenes.largest(problem.particles.plastic_strain) > 0.3
 
 
-@pytest.mark.parametrize("after", [1, 4])
+@pytest.mark.parametrize("after", [*slow(1), 4])
 def test_within_cutbacks(after, mpi_tmp_path):
     path = mpi_tmp_path / "block.ckpt"
     law = Brittle(0.02, 30.0, 200.0)

@@ -10,7 +10,7 @@ from mpi4py import MPI
 import numpy as np
 import pytest
 from compare import EXACT, raises
-from marks import thinned
+from marks import slow, thinned
 from obstacles import wall
 from posed import posed
 from routes import ROUTES, on_route
@@ -48,6 +48,7 @@ SCHEMES = [
     ("conserving", "reflect"),
     ("euler", "project"),
 ]
+ON_DEGREES = [(degree, *scheme) for degree in (1, 2) for scheme in SCHEMES]
 
 
 def plate(comm=WORLD, degree=1):
@@ -94,8 +95,7 @@ def nodal(function):
 # -- Free bodies, exactly -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
+@pytest.mark.parametrize(("degree", "scheme", "out"), thinned(3, ON_DEGREES))
 def test_a_free_body_flies_on(scheme, out, degree):
     problem = spinning(
         square(degree=degree),
@@ -117,8 +117,7 @@ def test_a_free_body_flies_on(scheme, out, degree):
     assert problem.kinetic_energy == pytest.approx(energy, rel=1e-9)
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
+@pytest.mark.parametrize(("degree", "scheme", "out"), thinned(3, ON_DEGREES))
 def test_dust_that_spins_flies_apart_in_straight_lines(scheme, out, degree):
     # Without stress each node keeps its velocity: x + t v(x), a motion in the range of T.
     dust = LinearElastic(1e-14, 0.3)
@@ -166,7 +165,7 @@ def test_a_load_in_time_gives_the_momentum_of_its_trapezium():
 # -- Energy, order --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
+@pytest.mark.parametrize(("scheme", "out"), thinned(2, SCHEMES))
 def test_a_spinning_body_keeps_momentum_and_its_account(scheme, out):
     problem = spinning(scheme=scheme, out_of_range=out)
     momentum, turning = problem.momentum, problem.angular_momentum
@@ -290,7 +289,7 @@ def test_both_routes_conserve_alike():
         (QUADRILATERAL, 1, "gimp"),
         (QUADRILATERAL, 2, "cpdi2"),
         (TRIANGLE, 3, "cpdi2"),
-        (HEXAHEDRON, 1, "cpdi2"),
+        pytest.param(HEXAHEDRON, 1, "cpdi2", marks=pytest.mark.slow),
     ],
 )
 def test_masses_reduced_domain_by_domain_are_those_of_stock_forms(cell, degree, method, take):
@@ -366,7 +365,7 @@ def sand_column(scheme):
     )
 
 
-@pytest.mark.parametrize("beta", [0.0, 0.03])
+@pytest.mark.parametrize("beta", [*slow(0.0), 0.03])
 def test_rayleigh_damping_lets_a_mode_decay_as_it_must(beta):
     # The amplitude of a mode w falls by exp(-(alpha + beta w^2) t / 2).
     w, t = np.pi, 1.0
@@ -474,7 +473,7 @@ def test_a_bar_bounces_off_a_plane(scheme, out):
     assert change_of_balance(history) < 1e-11
 
 
-@pytest.mark.parametrize("scheme", ["midpoint", "euler"])
+@pytest.mark.parametrize("scheme", ["midpoint", *slow("euler")])
 def test_a_quiet_boundary_lets_a_pulse_go(scheme):
     # A pulse that runs to the left (v = c d') leaves the bar of wave speed 1 through its end.
     V = vectors(box([0.0, 0.0], [1.6, 3 / 32], [51, 3], QUADRILATERAL))
@@ -735,7 +734,7 @@ def test_dirichlet_values_that_move_are_followed_by_what_projects():
     assert change_of_balance_of(history, history.energies[-1].kinetic) < 1e-12
 
 
-@pytest.mark.parametrize("out", ["project", "reflect"])
+@pytest.mark.parametrize("out", ["project", *slow("reflect")])
 def test_a_pushed_bar_carries_the_wave(tmp_path, out):
     # The background's left end pushes; the account has its work; a restart goes on bit for bit.
     def pushed():
@@ -856,8 +855,9 @@ def thrown(comm=WORLD, out="project", scheme="midpoint", **options):
     return spinning(particles, law, **loads, **options)
 
 
-@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
-@pytest.mark.parametrize("out", ["project", "reflect"])
+@pytest.mark.parametrize(
+    ("scheme", "out"), thinned(3, product(["midpoint", "conserving"], ["project", "reflect"]))
+)
 def test_a_run_that_is_restored_goes_on_bit_for_bit(tmp_path, out, scheme):
     path = WORLD.bcast(tmp_path) / "run.ckpt"
     whole = thrown(out=out, scheme=scheme)
@@ -983,8 +983,7 @@ def test_a_split_between_two_steps_keeps_momentum(scheme):
         np.testing.assert_allclose(problem.momentum, expected - fallen, atol=1e-11)
 
 
-@pytest.mark.parametrize("what", ["split", "rebase"])
-@pytest.mark.parametrize("damping", [0.0, 1e-3])
+@pytest.mark.parametrize(("what", "damping"), thinned(3, product(["split", "rebase"], [0.0, 1e-3])))
 def test_other_meshes_between_two_steps_are_no_other_run(what, damping):
     # Stresses of whole steps know what the new mesh is strained by, also within one run.
     def change(problem):
@@ -1131,10 +1130,10 @@ def standing(f_bar="none"):
 @pytest.mark.parametrize(
     ("scheme", "out", "f_bar", "route"),
     [
-        ("midpoint", "project", "none", "loops"),
+        pytest.param("midpoint", "project", "none", "loops", marks=pytest.mark.slow),
         ("midpoint", "reflect", "domain", "loops"),
         ("conserving", "project", "none", "reference"),
-        ("conserving", "reflect", "none", "loops"),
+        pytest.param("conserving", "reflect", "none", "loops", marks=pytest.mark.slow),
         ("euler", "project", "none", "loops"),
     ],
     indirect=["route"],
@@ -1298,8 +1297,10 @@ def resting(law, **options):
     return particles, static, {**given, **options}
 
 
-@pytest.mark.parametrize(("scheme", "out"), SCHEMES)
-@pytest.mark.parametrize("f_bar", ["none", "domain"])
+@pytest.mark.parametrize(
+    ("f_bar", "scheme", "out"),
+    thinned(3, [(f_bar, *scheme) for f_bar in ("none", "domain") for scheme in SCHEMES]),
+)
 def test_a_body_in_equilibrium_stays_at_rest(scheme, out, f_bar):
     law = VonMises(40.0, 0.3, rho_y=1.0)
     options = {} if f_bar == "none" else {"f_bar": f_bar, "quadrature_degree": 2}

@@ -23,7 +23,7 @@ def law(case):
         (A, 64, "gimp", 4.357e-4),
         (B, 16, "gimp", 3.844e-3),
         (A, 16, "mpm", 8.7e-2),
-        (A, 64, "mpm", 8.3e-2),
+        pytest.param(A, 64, "mpm", 8.3e-2, marks=pytest.mark.slow),
         (A, 16, "cpdi", 2.57e-3),
     ],
 )

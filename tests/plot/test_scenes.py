@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from marks import slow, thinned
 from ranks import fails
 from scenes import HEXAHEDRON, TRIANGLE, WORLD, at, block, box, fix, vectors
 
@@ -156,7 +157,7 @@ def test_scene_in_space_is_rendered_without_a_word(tmp_path, recwarn, capfd):
         require_apart(figure)
 
 
-@pytest.mark.parametrize("every, frames", [(1, 6), (2, 4)])
+@pytest.mark.parametrize("every, frames", thinned(2, [(1, 6), (2, 4)]))
 def test_movie_has_a_frame_for_each_step(tmp_path, every, frames):
     image = pytest.importorskip("PIL.Image")
     problem = block()
@@ -239,7 +240,7 @@ def test_an_obstacle_is_drawn_where_it_is():
     assert ax.get_ylim()[1] > 1.3  # as far as it is near the body
 
 
-@pytest.mark.parametrize("kind", ["sphere", "hills", "nowhere"])
+@pytest.mark.parametrize("kind", [*slow("sphere"), "hills", "nowhere"])
 def test_obstacles_in_space_are_rendered(kind):
     pytest.importorskip("pyvista")
     shape = {
@@ -261,7 +262,7 @@ def coloured(pixels):
     return places.min(axis=0), places.max(axis=0) + 1
 
 
-@pytest.mark.parametrize("wide", [1.0, 100.0])
+@pytest.mark.parametrize("wide", [*slow(1.0), 100.0])
 def test_bodies_in_space_fill_the_picture_whatever_is_around_them(wide):
     pytest.importorskip("pyvista")
     V = vectors(box([-wide] * 3, [1.0 + wide] * 3, [8] * 3, HEXAHEDRON))

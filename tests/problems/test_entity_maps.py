@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from marks import thinned
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, at, box
 
 import basix.ufl
@@ -81,7 +82,7 @@ def rubbing(cell, on_facets=True):
 
 @pytest.mark.parametrize(
     ("cell", "route"),
-    [(QUADRILATERAL, "loops"), (TRIANGLE, "loops"), (QUADRILATERAL, "reference")],
+    thinned(2, [(QUADRILATERAL, "loops"), (TRIANGLE, "loops"), (QUADRILATERAL, "reference")]),
     indirect=["route"],
 )
 @pytest.mark.usefixtures("route")

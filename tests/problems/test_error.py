@@ -340,7 +340,7 @@ def ground(cells, degree, offset=0.37, free=False, law=None, load=0.01, **stress
     return mpm.QuasiStaticProblem(given, supports=held), pressure
 
 
-@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("degree", [*slow(1), 2])
 def test_initial_stress_is_no_deformation(degree, mpi_tmp_path):
     """Ground that carries its weight already errs by as much as weightless one under a load."""
     plain, _ = ground(4, degree)
@@ -405,7 +405,7 @@ def stress_off_by(problem, fine, shear=1e3 / 2.6, bulk=1e3 / 1.2):
 @pytest.mark.parametrize("offset", [0.37, *slow(0.0)])
 @pytest.mark.parametrize(
     "case",
-    [(CLAY, 4.8, True), (SAND, 10.0, True), *slow((CLAY, 2.3, False), (SAND, 5.0, False))],
+    [(CLAY, 4.8, True), *slow((SAND, 10.0, True), (CLAY, 2.3, False), (SAND, 5.0, False))],
     ids=["clay near its limit", "sand near its limit", "clay that hardly yields", "sand"],
 )
 def test_where_ground_yields_it_is_the_error_of_the_stress(case, offset, size):
@@ -444,7 +444,7 @@ def test_locking_is_seen():
     assert locked.error() > 0.6 > 0.15 > free.error()
 
 
-@pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL, TETRAHEDRON, HEXAHEDRON])
+@pytest.mark.parametrize("cell", [TRIANGLE, *slow(QUADRILATERAL, TETRAHEDRON), HEXAHEDRON])
 def test_it_falls_with_the_cells(cell):
     errors = []
     for n in (2, 4):

@@ -47,7 +47,7 @@ def fill(lifts, rows, cutoff=None, **options):
     return problem
 
 
-@pytest.mark.parametrize(("lifts", "seconds", "solves"), [(1, 0, 30), (2, 1, 60)])
+@pytest.mark.parametrize(("lifts", "seconds", "solves"), thinned(2, [(1, 0, 30), (2, 1, 60)]))
 def test_what_a_prediction_is_too_far_from_is_found(lifts, seconds, solves):
     """Newton's method goes forward over folds; where it goes round still, it begins at zero."""
     problem = fill(lifts, 4 // lifts, stabilisation=None)

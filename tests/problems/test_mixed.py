@@ -2,13 +2,15 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """A pressure as an unknown of built-in materials, against UFL, differences and exact solutions."""
 
+from itertools import product
+
 from mpi4py import MPI
 
 import numpy as np
 import pytest
 import scenes
 from compare import EXACT, error_of_blocks, outcome, raises, same_run
-from marks import thinned
+from marks import slow, thinned
 from posed import posed
 from routes import ROUTES, on_route
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
@@ -603,7 +605,7 @@ def pressed_again(problem, laws, tags):
     )
 
 
-@pytest.mark.parametrize("name", ["mohr-coulomb", "drucker-prager"])
+@pytest.mark.parametrize("name", ["mohr-coulomb", *slow("drucker-prager")])
 def test_soil_in_a_stage(name, mpi_tmp_path):
     """A stage that changes nothing holds nothing back, from a file and after a failure too."""
     ends = []
@@ -802,7 +804,7 @@ def turning(scheme, law=STIFF, mixed="pressure", **options):
     )
 
 
-@pytest.mark.parametrize("scheme", ["midpoint", "conserving"])
+@pytest.mark.parametrize("scheme", [*slow("midpoint"), "conserving"])
 def test_a_body_that_turns(scheme):
     """The volume stays, so does energy, and angular momentum by the conserving scheme."""
     problem = turning(scheme)
@@ -850,8 +852,11 @@ def test_the_tangent_of_soil_in_motion(scheme):
     assert error_of_blocks(problem, step=1e-6, size=1e-4) <= 1e-6
 
 
-@pytest.mark.parametrize("law", LAWS, ids=lambda law: type(law).__name__)
-@pytest.mark.parametrize("scheme", ["midpoint", "conserving", "euler"])
+@pytest.mark.parametrize(
+    ("law", "scheme"),
+    thinned(2, product(LAWS, ["midpoint", "conserving", "euler"])),
+    ids=lambda it: it if isinstance(it, str) else type(it).__name__,
+)
 def test_the_tangent_in_motion(scheme, law):
     problem = turning(scheme, law, rayleigh=(0.5, 1e-3))
     problem.solve(time=0.06, dt=0.03)

@@ -7,6 +7,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 import scenes
+from marks import slow, thinned
 from posed import posed
 from scenes import QUADRILATERAL, TRIANGLE, WORLD, falling
 
@@ -182,7 +183,7 @@ def test_pictures_and_series_know_deleted_particles(tmp_path):
 
 
 @pytest.mark.skip_in_parallel  # (round-off of ranks decides the way of sand on a row)
-@pytest.mark.parametrize(("up", "kind"), [(False, QUADRILATERAL), (True, TRIANGLE)])
+@pytest.mark.parametrize(("up", "kind"), thinned(2, [(False, QUADRILATERAL), (True, TRIANGLE)]))
 def test_a_floor_is_as_a_row_of_cells_that_is_held(up, kind):
     # What falls in a step into cells that are held stays there; so it does where there are none.
     floor, row = (sand(None, up, kind, more) for more in (False, True))
@@ -222,7 +223,7 @@ def thrown_down():
 
 
 @pytest.mark.skip_in_parallel  # (round-off of ranks decides the way of sand below its floor)
-@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("moves", [*slow(False), True])
 def test_what_is_below_a_floor_that_is_let_go_or_moved_is_outside(moves):
     problem = sand(None, up=False)
     V = problem.particles.V

@@ -52,7 +52,7 @@ def uniform(model, energy):
         (LinearElastic, "none", 2, "AT1"),
         (LinearElastic, "spectral", 2, "AT2"),
         (Hencky, "volumetric", 2, "AT1"),
-        (Hencky, "spectral", 3, "AT1"),
+        pytest.param(Hencky, "spectral", 3, "AT1", marks=pytest.mark.slow),
         (NeoHooke, "volumetric", 2, "AT2"),
     ],
 )

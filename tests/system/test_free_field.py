@@ -2,9 +2,12 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Bodies of which some nodes are free and the others carried."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import scenes
+from marks import thinned
 from scenes import HEXAHEDRON, QUADRILATERAL, TRIANGLE, WORLD, at
 
 import ufl
@@ -100,8 +103,10 @@ def test_conditions_on_the_background_hold_free_nodes_too():
     assert np.abs(np.array(forces) - its).max() < 1e-9 * np.abs(forces).max()
 
 
-@pytest.mark.parametrize("free", [every, "auto", right], ids=["every", "auto", "right"])
-@pytest.mark.parametrize("kind", [mpm.QuasiStaticProblem, mpm.DynamicProblem])
+@pytest.mark.parametrize(
+    ("kind", "free"),
+    thinned(2, product([mpm.QuasiStaticProblem, mpm.DynamicProblem], [every, right, "auto"])),
+)
 @pytest.mark.filterwarnings("ignore:Time steps of")
 def test_held_dofs_of_the_background_lead_free_nodes_over_steps(kind, free, mpi_tmp_path):
     """They go on to follow what holds them, to and fro, off the lines where that is, and let go.

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from laws import Sulky
-from marks import slow
+from marks import slow, thinned
 from scenes import HEXAHEDRON, PLANE, QUADRILATERAL, TRIANGLE, WORLD, A, B
 
 from dolfinx import fem
@@ -112,8 +112,7 @@ def test_map_to_background_gives_increments_back(cell):
 # -- Runs --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ne", [16, 64])
-@pytest.mark.parametrize("case", [A, B], ids="AB")
+@pytest.mark.parametrize(("case", "ne"), thinned(3, [(A, 16), (A, 64), (B, 16), (B, 64)]))
 def test_fewer_solves_for_the_same_answer(case, ne):
     results = []
     for predictor in (False, True):
