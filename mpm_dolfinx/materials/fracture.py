@@ -56,10 +56,10 @@ class Fracture(StrainMaterial):
         model: ``"AT1"``: w = d, c_w = 8/3: elastic up to a stress ``sqrt(3 G_c E / (8 l))`` and
             damage in a band of 2 l to each side alone; ``"AT2"``: w = d^2, c_w = 2: damage grows
             from the first load on.
-        split: What of the energy psi degrades: ``"volumetric"``: all but that of a volume that is
-            pressed together (Amor et al. 2009); ``"spectral"``: that of positive principal strains
-            and of a volume that grows (Miehe et al. 2010), for laws linear in their strain;
-            ``"none"``: all.
+        split: What of the energy psi degrades: ``"spectral"``: that of positive principal strains
+            and of a volume that grows (Miehe et al. 2010), for laws linear in their strain, where
+            it is the default; ``"volumetric"``: all but that of a volume that is pressed together
+            (Amor et al. 2009), so that what is broken gives way sideways; ``"none"``: all.
 
     Raises:
         MPMError: A law that is not elastic, numbers that are not positive, or unknown names.
@@ -80,13 +80,15 @@ class Fracture(StrainMaterial):
         length: ArrayLike | Field,
         *,
         model: str = "AT1",
-        split: str = "volumetric",
+        split: str | None = None,
     ) -> None:
         if not isinstance(law, StrainMaterial) or not law.is_elastic:
             raise MPMError(
                 "Fracture is of an elastic law in strain space, such as Hencky, LinearElastic or "
                 f"NeoHooke, not of {law!r}."
             )
+        if split is None:
+            split = "spectral" if isinstance(law, IsotropicElastic) else "volumetric"
         for name, value, known in (("model", model, MODELS), ("split", split, SPLITS)):
             if not is_one_of(value, known):
                 raise MPMError(
