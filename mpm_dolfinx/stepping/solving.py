@@ -213,12 +213,6 @@ class StepSolver:
             "one that grows all the way, such as the opening of a crack."
         )
 
-    def size_of_forces(self) -> float:
-        """Return the size of the forces on nodes in the last evaluation (collective)."""
-        for term in self.system.body_terms:
-            term.begin()  # (with a load factor that is found, loads are those before yet)
-        return self.system.reduced.terms.size_of_forces()
-
     def commit(self, goal: Goal, parameter: float) -> Converged:
         """Make the step that was solved the converged one (collective).
 

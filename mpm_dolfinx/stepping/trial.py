@@ -216,7 +216,9 @@ class Trial:
             if not goal.again and (sentence := solver.jump(size, parameter)) is not None:
                 warn(comm, sentence)
             parameter = float(owner.bodies[0].load.value)
-        force = solver.size_of_forces() if owner.at_rest else None
+            for term in solver.system.body_terms:
+                term.begin()  # (loads are those before the factor was found yet)
+        force = self.reduced.terms.size_of_forces() if owner.at_rest else None
         try:
             converged = solver.commit(goal, parameter)
         except BaseException:
