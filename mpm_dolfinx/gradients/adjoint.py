@@ -29,10 +29,10 @@ from ..reals import as_reals
 from ..stepping.trial import Trial
 from ..tolerances import DIFFERENCE
 from .backward import Backward, Record, Weights, copied, no_weights
+from .followed import Followed, require_followed
 from .laws import Laws
 from .many import Many, assembled
 from .nearby import varying
-from .sensitivity import require_followed
 
 __all__ = ["Adjoint"]
 
@@ -102,7 +102,8 @@ class Adjoint:
         self._records: list[Record] = []
         self._trial: Trial | None = None
         self._reduced = problem.reduced
-        self._values = [one.function.x.array.copy() if one.function else None for one in self._many]
+        parameters = [one.parameter for one in self._many]
+        self._followed = Followed(problem, parameters, "An Adjoint")
         problem.trial.record(self)
 
     @property
@@ -118,9 +119,7 @@ class Adjoint:
     def solved(self, trial: Trial) -> Callable[[], None]:
         """Note a step that is solved; see :class:`.Recorder`."""
         problem = self.problem
-        self._require_present()
-        if trial.run is not None and trial.run.goal is not None:
-            raise MPMError("An Adjoint does not follow displacement control; apply a load.")
+        self._followed.require_step(trial)
         before = [body.converged_displacement.copy() for body in problem.bodies]
         record = Record(
             self._records[-1].after if self._records else before,
@@ -135,6 +134,7 @@ class Adjoint:
         def take() -> None:
             self._trial = trial
             self._records.append(record)
+            self._followed.note()
 
         return take
 
@@ -148,24 +148,6 @@ class Adjoint:
             for value in found
             if all(value is not own for own in mine)
         ]
-
-    def _require_present(self) -> None:
-        """Raise an error where the problem is in another state than that which was followed."""
-        bodies = self.problem.bodies
-        same = self._reduced is self.problem.reduced
-        if same and self._records:
-            pairs = zip(bodies, self._records[-1].after, strict=True)
-            same = all(np.array_equal(b.converged_displacement, after) for b, after in pairs)
-        values = zip(self._many, self._values, strict=True)
-        for one, value in values:
-            one.parameter.require_unchanged()
-            if one.function is not None and value is not None:
-                same = same and np.array_equal(one.function.x.array, value)
-        if not bodies[0].mesh.comm.allreduce(same, MPI.LAND):
-            raise MPMError(
-                "The problem has come to another state than by the steps that an Adjoint follows "
-                "(a stage, a checkpoint, other meshes); make a new problem and a new Adjoint."
-            )
 
     # -- Before the first step ------------------------------------------------------------------
 
@@ -247,7 +229,7 @@ class Adjoint:
         Returns:
             An array for each parameter: one number, or one for each local dof of a Function.
         """
-        self._require_present()
+        self._followed.require_present()
         if self._trial is None:
             raise MPMError("There is no step yet that an Adjoint could go through.")
         look = self._look_of(functional)

@@ -18,15 +18,15 @@ from ..parallel.boundary import collective, of_user
 from ..parallel.given import as_positive, require_same
 from ..problems.motion import MovingProblem
 from ..problems.problem import Problem
-from ..problems.quasistatic import QuasiStaticProblem
 from ..reals import as_reals
 from ..stepping.control import Run
 from ..stepping.trial import Trial
+from .followed import Followed, require_followed
 from .forward import StepDerivative
 from .nearby import Nearby, Rates, followed, varying, without_tangents
 from .parameters import as_parameter
 
-__all__ = ["Sensitivity", "require_followed"]
+__all__ = ["Sensitivity"]
 
 type Array = NDArray[np.float64]
 
@@ -90,11 +90,10 @@ class Sensitivity:
         if not self._parameters:
             raise MPMError("Name a parameter to differentiate by.")
         require_same(problem.bodies[0].mesh.comm, names=[one.name for one in self._parameters])
-        self._reduced = problem.reduced
+        self._followed = Followed(problem, self._parameters, "A Sensitivity")
         self._trial: Trial | None = None
         self._run: Run | None = None
         self._rates, self._nearby = self._beginning()
-        self._note()
         problem.trial.record(self)
 
     # -- Results --------------------------------------------------------------------------
@@ -121,7 +120,7 @@ class Sensitivity:
         Returns:
             One more axis than what it returns: the last one is that of parameters.
         """
-        self._require_present()
+        self._followed.require_present()
         comm = self.problem.bodies[0].mesh.comm
         look = of_user(comm, function)
         columns = []
@@ -169,7 +168,7 @@ class Sensitivity:
         Raises:
             MPMError: There are none.
         """
-        self._require_followed(trial)
+        self._followed.require_step(trial)
         reduced, newton = trial.reduced, trial.newton
         rates = self._rates
         if trial.run is not None and trial.run is not self._run:
@@ -187,7 +186,7 @@ class Sensitivity:
 
         def take() -> None:
             self._trial, self._run, self._rates = trial, trial.run, found
-            self._note()
+            self._followed.note()
 
         return take
 
@@ -197,7 +196,7 @@ class Sensitivity:
         Raises:
             MPMError: There are none.
         """
-        self._require_present()
+        self._followed.require_present()
         problem, points = self.problem, self.problem.points
         assert isinstance(problem, MovingProblem)
         with self._nearby.held():
@@ -218,7 +217,7 @@ class Sensitivity:
         """Return the derivatives of what the bodies begin with, and the state (collective)."""
         problem = self.problem
         points, found = problem.points, []
-        none = [np.zeros(len(f.bodies[0].increment.x.array)) for f in self._reduced.fields]
+        none = [np.zeros(len(f.bodies[0].increment.x.array)) for f in problem.reduced.fields]
         for parameter in self._parameters:
             sides = []
             for sign in (1.0, -1.0):
@@ -257,36 +256,6 @@ class Sensitivity:
             )
         return found, Nearby(problem)
 
-    def _note(self) -> None:
-        """Take note of where the bodies are."""
-        self._places = [body.converged_displacement.copy() for body in self.problem.bodies]
-
-    def _require_present(self) -> None:
-        """Raise an error where the problem is in another state than that which was followed."""
-        bodies = self.problem.bodies
-        with agree(bodies[0].mesh.comm):
-            same = self._reduced is self.problem.reduced and all(
-                np.array_equal(body.converged_displacement, place)
-                for body, place in zip(bodies, self._places, strict=True)
-            )
-            if not same:
-                raise MPMError(
-                    "The problem has come to another state than by the steps that a Sensitivity "
-                    "follows (a stage, a checkpoint, other meshes); make a new problem and a "
-                    "new Sensitivity."
-                )
-            for parameter in self._parameters:
-                parameter.require_unchanged()
-
-    def _require_followed(self, trial: Trial) -> None:
-        """Raise an error where a step has what has no part in the derivative."""
-        self._require_present()
-        if trial.run is not None and trial.run.goal is not None:
-            raise MPMError(
-                "A Sensitivity does not follow displacement control, whose load factor depends on "
-                "the parameters too; apply a load."
-            )
-
 
 def _numbers(value: Any) -> Array:
     """Return the result of a user's function, as numbers.
@@ -300,50 +269,3 @@ def _numbers(value: Any) -> Array:
         raise MPMError(
             f"A function of Sensitivity.of must return a number or an array, not {value!r}."
         ) from None
-
-
-def require_followed(problem: Problem, who: str) -> None:
-    """Raise an error unless the derivative of a problem's steps has all that acts in them.
-
-    Args:
-        problem: The problem.
-        who: Follows it.
-
-    Raises:
-        MPMError: Something acts that has no part in it yet.
-    """
-    if not isinstance(problem, Problem):
-        raise MPMError(f"{who} follows a problem, not a {type(problem).__name__}.")
-    what = next(iter(_not_in(problem)), None)
-    if what is not None:
-        raise MPMError(f"{who} does not follow {what} yet.")
-    if problem.history.steps or any(np.any(b.converged_displacement) for b in problem.bodies):
-        raise MPMError(f"{who} follows a problem from its first step on; make it before.")
-
-
-def _not_in(problem: Problem) -> list[str]:
-    """Return the parts of a problem that have none in the derivative, in words."""
-    bodies, kind = problem.bodies, type(problem)
-    hooks = ("evaluate", "commit", "roll_back")
-    setup = problem.setup if isinstance(problem, QuasiStaticProblem) else None
-    own = problem.inertia if isinstance(problem, MovingProblem) else None
-    missing = {
-        "a pressure in place of the mean stress (mixed=)": setup and setup.mixed is not None,
-        "a law of fracture (materials.Fracture)": setup and any(b.may_crack for b in setup.given),
-        "bodies with a length=": any(points.softening is not None for points in problem.points),
-        "fields that are solved in turn with the displacements": problem.reduced.terms.alternates,
-        "terms= (contact, ties)": any(term is not own for term in problem.terms),
-        "particles of other methods than 'cpdi2'": any(
-            not (b.method == "cpdi2" or b.is_free) for b in bodies
-        ),
-        "bodies with free nodes (free=)": any(b.free_nodes is not None for b in bodies),
-        "bodies whose particles may be deleted": any(b.deletion is not None for b in bodies),
-        "bodies whose domains are split": any(b.on_distortion == "split" for b in bodies),
-        "rebased bodies": any(b.undeformed.differs for b in bodies),
-        "hooks of a subclass (evaluate, commit, roll_back)": any(
-            getattr(kind, name) is not getattr(Problem, name) for name in hooks
-        ),
-        "Functions at quadrature points in a residual": bool(problem.built.data)
-        and not problem.keeps_data,
-    }
-    return [name for name, present in missing.items() if present]

@@ -352,6 +352,16 @@ def test_wrong_functionals_and_parameters_are_told():
     assert adjoint.of(scene.form)[0] == slope  # (all is as it was)
 
 
+def test_a_value_that_changes_on_one_rank_is_told_on_all_ranks():
+    scene = Layered()
+    young = scene.named["young"]
+    adjoint = mpm.Adjoint(scene.problem, [young])
+    scene.problem.solve(1)
+    young.x.array[:1] *= 1.1 if WORLD.rank == 0 else 1.0
+    with pytest.raises(mpm.MPMError, match="has changed"):
+        adjoint.of(scene.form)
+
+
 def test_what_is_not_gone_through_is_refused():
     scene = Layered()
     with pytest.raises(mpm.MPMError, match="Name a parameter"):
