@@ -26,9 +26,9 @@ __all__ = [
     "nodal_forces",
     "quadrature_element",
     "quadrature_rule",
+    "shape_averages",
     "vector_product",
     "volume_ratio",
-    "volumes_and_averages",
     "with_hoop",
 ]
 
@@ -133,29 +133,23 @@ class DomainQuadrature:
         return gradient
 
 
-def volumes_and_averages(
-    body: mesh.Mesh, shape_functions: Any, degree: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return volumes of the domains this rank owns, and averages of shape functions over them.
+def shape_averages(body: mesh.Mesh, shape_functions: Any, degree: int) -> NDArray[np.float64]:
+    """Return averages of shape functions over the domains this rank owns, shape ``(n, k)``.
 
     Args:
         body: The body mesh.
         shape_functions: basix element of W.
-        degree: Degree of a rule that is exact for both.
-
-    Returns:
-        Shapes ``(n,)`` and ``(n, k)``.
+        degree: Degree of a rule that is exact for them.
     """
     points, weights = quadrature_rule(body.basix_cell(), degree)
     nodes, slopes = _geometry(body, points)
     shapes = shape_functions.tabulate(0, points)[0, :, :, 0]
-    volumes, averages = np.empty(len(nodes)), np.empty((len(nodes), shapes.shape[1]))
+    averages = np.empty((len(nodes), shapes.shape[1]))
     for start in range(0, len(nodes), BLOCK):  # the Jacobians are many times the size of a body
         part = slice(start, start + BLOCK)
         sizes = weights * np.abs(determinant(_jacobians(nodes[part], slopes)))
-        volumes[part] = sizes.sum(axis=1)
-        averages[part] = sizes @ shapes / volumes[part, None]
-    return volumes, averages
+        averages[part] = sizes @ shapes / sizes.sum(axis=1, keepdims=True)
+    return averages
 
 
 def cell_volumes(domain: mesh.Mesh) -> NDArray[np.float64]:

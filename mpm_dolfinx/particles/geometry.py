@@ -19,10 +19,11 @@ from ..meshes.jacobian_bound import JacobianBound, jacobians
 from ..meshes.order import vtk_cell
 from ..meshes.quadrature import (
     DomainQuadrature,
+    cell_volumes,
     default_degree,
     exact_degree,
     quadrature_element,
-    volumes_and_averages,
+    shape_averages,
 )
 from .options import Coordinates
 
@@ -121,18 +122,14 @@ class Geometry:
         return np.asarray(self.nodes[self.domain_nodes])
 
     @cached_property
-    def _volumes_and_averages(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return volumes_and_averages(self.mesh, self.shape_functions, self.exact_degree)
-
-    @property
     def volumes(self) -> NDArray[np.float64]:
         """Volume of each domain, shape ``(n,)``; an area in the plane."""
-        return self._volumes_and_averages[0]
+        return cell_volumes(self.mesh)
 
-    @property
+    @cached_property
     def averages(self) -> NDArray[np.float64]:
         """Averages of the shape functions over the domains, shape ``(n, k)``."""
-        return self._volumes_and_averages[1]
+        return shape_averages(self.mesh, self.shape_functions, self.exact_degree)
 
     def require_volume(self, rule: DomainQuadrature) -> None:
         """Raise an error unless all domains have a volume at the points of a rule (collective).

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, override
 
+from mpi4py import MPI
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,7 @@ from ..constitutive.beginning import begin_unstrained, begin_with_stress
 from ..constitutive.groups import background_cells
 from ..constitutive.identity import identity
 from ..errors import MPMError, agree, not_with, warn
+from ..meshes.quadrature import cell_volumes
 from ..meshes.redistribution import Redistribution
 from ..parallel.boundary import collective
 from ..parallel.given import is_number
@@ -531,8 +534,12 @@ def _warn_of_hourglass(particles: Particles) -> None:
     few = points <= degree**particles.mesh.geometry.dim
     if not few or cell not in ("quadrilateral", "hexahedron"):
         return
+    comm, volume = particles.mesh.comm, particles.initial_volume
+    least = comm.allreduce(cell_volumes(particles.V.mesh).min(initial=np.inf), MPI.MIN)
+    if comm.allreduce(float(volume.sum())) <= CROWDED * particles.num_global * least:
+        return  # wherever they are
     _, size = background_cells(particles)
-    fill = particles.mesh.comm.allreduce(float((particles.initial_volume / size).sum()))
+    fill = comm.allreduce(float((volume / size).sum()))
     if fill > CROWDED * particles.num_global:
         cure = "use two domains each way in a cell"
         if degree > 1:
@@ -540,7 +547,7 @@ def _warn_of_hourglass(particles: Particles) -> None:
         elif particles.shares_nodes:
             cure = f"use quadrature_degree=2 with f_bar='domain', or {cure[4:]}"
         warn(
-            particles.mesh.comm,
+            comm,
             f"The domains have {'one' if points == 1 else points} quadrature point"
             f"{'s'[: points > 1]} each and are about as large as the cells of the background, so "
             f"motions without strain (hourglass) meet no resistance; {cure}.",
