@@ -93,7 +93,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 @pytest.hookimpl(trylast=True)  # of those that are not slow
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if config.getoption("between_ranks"):
-        items[:], others = between_ranks(items)
+        items[:], others = between_ranks(items, comm.size)
         config.hook.pytest_deselected(items=others)
 
 

@@ -10,11 +10,10 @@ import pytest
 EVERY = 11
 #: Whole runs, whose answers one rank has looked at, and how many of them several ranks do again.
 WHOLE_RUNS = re.compile(
-    r"tests/(contact|gradients|plot|solvers|stepping|structures)/|"
-    r"/test_(averaging|damage|error|fills|mixed|porous|rates|sections|stages|strength|supports|"
-    r"undrained)\.py"
+    r"tests/(boundary|constitutive|contact|gradients|plot|problems|solvers|stabilisation|stepping|"
+    r"structures|system)/|/test_sections\.py"
 )
-SOME = 4
+SOME = 8
 #: What ranks do together in them: tests that say so stay.
 TOGETHER = re.compile(
     "checkpoint|combination|ends_on|fail|feature|interrupt|mesh|no_sense|refuse|repartition|"
@@ -49,18 +48,22 @@ def all_but(quick, values):
     return [v if v in quick else pytest.param(v, marks=pytest.mark.slow) for v in values]
 
 
-def between_ranks(items):
+def between_ranks(items, ranks):
     """Part a run on several ranks into what ``make test`` does, and what it leaves to one rank.
 
     One rank has run everything. Several ranks run
 
-    - in full what has ranks as its subject: files called ``parallel``, functions with ``rank`` in
-      their name, tests marked ``mpi``,
+    - what has ranks as its subject: files called ``parallel``, functions with ``rank`` in their
+      name, tests marked ``mpi``; two ranks all sets of parameters, more ``EVERY`` of each at most,
     - of each other function one in ``EVERY`` of its sets of parameters: a ghost, a boundary between
       parts or a collective call does not know Poisson's ratio,
     - in rooms of whole runs only one function in ``SOME``, and each that is about what ranks do
       together, such as errors, files or other meshes: what runs are made of has its own tests,
     - of physics, and of what a rank does for itself, only what is about ranks or such things.
+
+    Args:
+        items: The tests.
+        ranks: How many there are.
 
     Returns:
         The tests to run, and the others.
@@ -68,10 +71,10 @@ def between_ranks(items):
     chosen, others, functions, sets = [], [], {}, {}
     for item in items:
         path, name = item.nodeid.split("::")[0], getattr(item, "originalname", item.name)
-        if "parallel" in path or "rank" in name or item.get_closest_marker("mpi"):
-            chosen.append(item)
-            continue
         place = sets[path, name] = sets.get((path, name), -1) + 1
+        if "parallel" in path or "rank" in name or item.get_closest_marker("mpi"):
+            (others if ranks > 2 and place >= EVERY else chosen).append(item)
+            continue
         left_out = place % EVERY
         if not TOGETHER.search(name):
             left_out = left_out or ALONE.search(path)

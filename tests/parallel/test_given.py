@@ -4,10 +4,12 @@
 
 import warnings
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
 import scenes
+from marks import thinned
 from posed import posed
 from ranks import LAST, differing, fails, in_step
 from scenes import QUADRILATERAL, WORLD
@@ -253,9 +255,17 @@ class Leaving(Hencky):
         return super().update(displacement_gradient, state, tangent)
 
 
-@pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit])
-@pytest.mark.parametrize("where", ["path", "first body", "second body"])
-@pytest.mark.parametrize("f_bar", ["none", "domain", "patch"])
+@pytest.mark.parametrize(
+    ("kind", "where", "f_bar"),
+    thinned(
+        5,
+        product(
+            [KeyboardInterrupt, SystemExit],
+            ["path", "first body", "second body"],
+            ["none", "domain", "patch"],
+        ),
+    ),
+)
 def test_one_rank_that_wants_to_end(kind, where, f_bar):
     V = scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [4, 6], QUADRILATERAL))
     meshes = [scenes.box([0.0, y], [1.0, y + 0.5], [4, 2], QUADRILATERAL) for y in (0.0, 0.5)]
