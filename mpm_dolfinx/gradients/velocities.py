@@ -73,7 +73,7 @@ class TakenVelocities:
         )
 
     def beside(self, changes: Sequence[Array]) -> Beginning:
-        """Return what the step begins with in a state beside, which the problem is in.
+        """Return the start of the step in a state beside, which the problem is in.
 
         Args:
             changes: Of Dirichlet values, on own dofs of each background.

@@ -121,7 +121,7 @@ class Record(Mapping[str, NDArray[np.float64]]):
             self._columns[name].append(value)
 
     def _value(self, function: Callable[[], Any]) -> Any:
-        """Return what a function does, or that it cannot be known yet."""
+        """Return the value of a function, not a number where it cannot be known yet."""
         try:
             return function()
         except Exception:  # of a user's function, on all ranks
