@@ -35,6 +35,7 @@ from ..materials.base import State
 from ..parallel.magnitudes import norm
 from ..problems.quasistatic import QuasiStaticProblem
 from ..solvers.newton import NewtonSolver
+from ..tolerances import ROUND_OFF
 from .laws import Laws
 from .nearby import add_product, varying, without_tangents
 from .slopes import Slopes
@@ -43,9 +44,8 @@ __all__ = ["Backward", "Record", "Weights", "copied", "no_weights"]
 
 type Array = NDArray[np.float64]
 
-#: What a residual may be when a step is gone through again, relative to the forces; what a linear
-#: solve leaves, and how often it is corrected.
-AGAIN, SOLVED, CORRECTIONS = 1e-6, 1e-13, 5
+#: What a residual may be when a step is gone through again, relative to the forces.
+AGAIN = 1e-6
 
 
 class Record(NamedTuple):
@@ -224,19 +224,8 @@ class Backward:
         for body, force in zip(self._problem.bodies, motion, strict=True):
             reduced.unknowns.add([body], [force], totals)
         right = reduced.unknowns.restricted(totals)
-        z, rest = right.duplicate(), right.copy()
-        z.set(0.0)
-        solve, size = self._newton.linearise(anew=True), norm(right)
-        K = self._newton.K
-        assert K is not None
-        for _ in range(CORRECTIONS):
-            if norm(rest) <= SOLVED * size:
-                break
-            part = rest.duplicate()
-            solve(rest, part)
-            z.axpy(1.0, part)
-            K.mult(z, rest)
-            rest.aypx(-1.0, right)
+        z = right.duplicate()
+        self._newton.linearise(anew=True, tolerance=ROUND_OFF)(right, z)
         return z
 
     def _moved(self, backgrounds: Sequence[PETSc.Vec]) -> list[fem.Function]:

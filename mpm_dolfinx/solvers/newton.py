@@ -146,11 +146,14 @@ class NewtonSolver:
     def experience(self, values: tuple[float, int]) -> None:
         self._predictions.kept, self._predictions.from_zero = values
 
-    def linearise(self, anew: bool = False) -> Callable[[PETSc.Vec, PETSc.Vec], None]:
+    def linearise(
+        self, anew: bool = False, tolerance: float = SOLVED
+    ) -> Callable[[PETSc.Vec, PETSc.Vec], None]:
         """Factorise the tangent at the solution (collective).
 
         Args:
             anew: Whether it is that of another step than the last one that was solved.
+            tolerance: Norm of ``b - K x`` that is small enough, relative to b's.
 
         Returns:
             A function of b and x that sets x to the solution of ``K x = b``, as far as K holds x.
@@ -164,7 +167,7 @@ class NewtonSolver:
 
         def solve(b: PETSc.Vec, x: PETSc.Vec) -> None:
             self._factor.solve(b, x)
-            self._factor.refine(b, x, SOLVED)
+            self._factor.refine(b, x, tolerance)
 
         return solve
 
