@@ -231,7 +231,7 @@ def boundary_tags(body):
 @pytest.mark.parametrize(
     ("kind", "f_bar", "degree", "follower", "bodies"),
     thinned(
-        5,
+        7,
         product(
             ["plane", "axisymmetric", "space"],
             ["none", "domain", "patch"],

@@ -20,6 +20,7 @@ CASES = Path(__file__).parents[2] / "benchmarks" / "cases"
 SHORT = ("compaction",)
 LONG = {
     *("sand-damped", "sand-dilates", "notch", "retrogression"),
+    *("adjoint", "lshape-adapt", "pile", "softening-turned"),
     *("cone", "cryer", "footing-weight", "wedge", "gradient-degree-2", "footing-friction"),
     *("gradient", "hertz-pair", "weight-recommended", "circle-recommended", "incline", "sand"),
     *("vortex", "disc", "discs", "discs-contact", "column"),

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import programs
 import pytest
-from marks import all_but
 
 pytestmark = pytest.mark.skip_in_parallel
 
@@ -48,7 +47,8 @@ def rows(cases, parts=()):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("case", all_but("H", SIZES))
+@pytest.mark.parametrize("case", SIZES)
+@pytest.mark.slow
 def test_errors_fall_with_the_size_of_cells(case):
     found = rows([case])
     assert found["extrapolated"] == pytest.approx([1.3, 3.0])

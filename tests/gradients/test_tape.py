@@ -120,6 +120,7 @@ def test_the_tangent_linear_model_is_what_the_adjoint_says():
 
 
 @pytest.mark.skip_in_parallel
+@pytest.mark.slow
 def test_a_stiffness_is_found_by_minimize():
     """In units in which its values are near 1, as a minimiser's first step is of that size."""
     block = Block(mpm.materials.Hencky, unit=1e4)

@@ -205,7 +205,7 @@ def test_rounded_apex_returns(m, hardening):
 
 @pytest.mark.parametrize("dim", [2, *slow(3)])
 @pytest.mark.parametrize(
-    "law", [*slow(DruckerPrager), LogarithmicDruckerPrager, AssociatedDruckerPrager]
+    "law", [*slow(DruckerPrager, LogarithmicDruckerPrager), AssociatedDruckerPrager]
 )
 def test_drucker_prager_tangents(dim, law):
     assert check_tangent(law(apex=0.2), dim, strain=1e-2, points=8, steps=2) < 1e-7

@@ -440,6 +440,7 @@ def bounced(n, dt):
     return (max(heights[lowest:]) - 0.25) / 0.1
 
 
+@pytest.mark.slow
 def test_a_ball_bounces_off_a_plane():
     assert 0.97 < bounced(4, 0.02) < 1.0
 

@@ -366,6 +366,7 @@ def hexahedra_difference(amount, samples=20000):
     return float(gradients), float(volumes)
 
 
+@pytest.mark.slow
 def test_how_far_distorted_hexahedra_are_from_the_published():
     assert hexahedra_difference(0.1) == pytest.approx((2.73e-2, 1.36e-3), rel=0.01)
     assert hexahedra_difference(0.0) == pytest.approx((0.0, 0.0), abs=1e-14)

@@ -8,6 +8,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from compare import outcome, same_run
+from marks import slow
 from posed import posed
 from scenes import (
     HEXAHEDRON,
@@ -347,7 +348,7 @@ def punched(water):
     )
 
 
-@pytest.mark.parametrize("water", [False, True])
+@pytest.mark.parametrize("water", [False, *slow(True)])
 def test_ground_that_is_rebased_goes_on_as_ground_that_is_not(water, mpi_tmp_path):
     straight, steps = punched(water)
     for _ in steps():

@@ -179,6 +179,7 @@ def test_the_same_as_in_ufl():
     assert scenes.largest(gap) < 1e-8 * scenes.largest(scenes.own(d))
 
 
+@pytest.mark.slow
 def test_a_large_settlement():
     """A column of which a third is lost: finite strain, and a permeability that makes it linear.
 

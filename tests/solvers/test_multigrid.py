@@ -77,7 +77,7 @@ def assert_same(direct, multigrid, failures=0):
         (9, {"degree": 2, "cell": TRIANGLE}),
         (6, {"degree": 3}),
         (5, {"cell": HEXAHEDRON}),
-        (5, {"cell": TETRAHEDRON}),
+        pytest.param(5, {"cell": TETRAHEDRON}, marks=pytest.mark.slow),
         (20, {"material": VonMises(1e6, 0.49, rho_y=20e3)}),
         (20, {"material": SAND, "weight": 4e3}),
     ],

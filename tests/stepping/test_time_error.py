@@ -141,7 +141,7 @@ def thrown(kind, **options):
         ("rigid", "midpoint"),
         ("plastic", "euler"),
         pytest.param("plastic", "conserving", marks=pytest.mark.slow),
-        ("pair", "conserving"),
+        pytest.param("pair", "conserving", marks=pytest.mark.slow),
         ("background", "euler"),
         pytest.param("body", "midpoint", marks=pytest.mark.slow),
     ],
