@@ -485,6 +485,8 @@ class Observer:
 
         With Jbar = sum w J / sum w and Fbar = (Jbar/J)^(1/dim) F in the plane or in space,
         P : dF = tau : (dF F^-1) + 1/dim tr(tau) (d ln Jbar - tr(dF F^-1)), tau that of Fbar.
+        A J that is more than exp(0.2) times its average, or less than exp(-0.2), costs energy:
+        3 G (|ln J/Jbar| - 0.2)^3 / 2.4, up to 0.6.
         """
         domains = self.domains[i]
         dim = 3 if domains.axisymmetric else domains.dim
@@ -501,6 +503,12 @@ class Observer:
             sigma = self.run.problem.points[i].last.cauchy_stress()
             tau = np.linalg.det(bar)[..., None, None] * sigma
         pressure = np.trace(tau[..., :dim, :dim], axis1=-2, axis2=-1) / dim
+        apart = np.log(J / mean[:, None])
+        excess = np.maximum(np.abs(apart) - 0.2, 0.0)
+        stiff = 1.5 * self.run.young / (1.0 + self.scene["material"]["poisson"])  # 3 G
+        pressure = pressure - stiff * np.sign(apart) * excess**2 / 0.8
+        if energy is not None:
+            energy = energy + stiff * excess**3 / 2.4
         shared = J * (w * pressure).sum(axis=1, keepdims=True) / (w * J).sum(axis=1, keepdims=True)
         acting = tau.copy()
         acting[..., :dim, :dim] += (shared - pressure)[..., None, None] * np.eye(dim)
