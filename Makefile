@@ -12,6 +12,8 @@ ARGS ?=
 
 export PYTHON VENV NP
 export OMP_NUM_THREADS := 1
+# Some containers forbid it: then each process, of some dozens, compiles all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 # Where compiled forms are kept, if not at home.
 ifneq ($(shell d="$${XDG_CACHE_HOME:-$$HOME/.cache}"; mkdir -p "$$d" 2>/dev/null && test -w "$$d" && echo yes),yes)

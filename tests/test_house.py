@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -56,9 +57,13 @@ def name_of(path: Path) -> str:
 
 
 PATHS = {name_of(path): path for path in sorted(ROOT.rglob("*.py"))}
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in PATHS.items()}
-NODES = {name: list(ast.walk(tree)) for name, tree in TREES.items()}
 FACES = {name for name, path in PATHS.items() if path.name == "__init__.py"}
+
+
+@cache
+def nodes_of(name: str) -> list[ast.AST]:
+    """Return all of a file's syntax tree, which is looked through once for all rules."""
+    return list(ast.walk(ast.parse(PATHS[name].read_text(encoding="utf-8"))))
 
 
 def imports(name: str) -> Iterator[tuple[str, str]]:
@@ -67,7 +72,7 @@ def imports(name: str) -> Iterator[tuple[str, str]]:
     Those within functions and below ``if TYPE_CHECKING`` count as well.
     """
     package = name if name in FACES else name.rpartition(".")[0]
-    for node in NODES[name]:
+    for node in nodes_of(name):
         if isinstance(node, ast.Import):
             for alias in node.names:
                 if alias.name.split(".")[0] == PACKAGE:
@@ -120,10 +125,10 @@ def private(name: str) -> bool:
 
 def foreign_underscores() -> Iterator[str]:
     """Yield uses of what another object or another module keeps to itself."""
-    for name, nodes in NODES.items():
+    for name in PATHS:
         if name == BRIDGE:
             continue
-        for node in nodes:
+        for node in nodes_of(name):
             if isinstance(node, ast.Attribute) and private(node.attr):
                 owner = ast.unparse(node.value)
                 if owner not in ("self", "cls", "type(self)", "super()"):
@@ -152,14 +157,14 @@ def circles() -> Iterator[str]:
 
 def made_again() -> Iterator[str]:
     """Yield what empties objects, initialises them again, or asks whether it was made before."""
-    for name, nodes in NODES.items():
+    for name in PATHS:
         constructors = [
             node
-            for node in nodes
+            for node in nodes_of(name)
             if isinstance(node, ast.FunctionDef) and node.name in ("__init__", "__new__")
         ]
         within = {id(inner) for node in constructors for inner in ast.walk(node)}
-        for node in nodes:
+        for node in nodes_of(name):
             if isinstance(node, ast.Attribute) and node.attr == "__dict__":
                 yield f"{name}: {ast.unparse(node)}"
             if not isinstance(node, ast.Call):
@@ -175,8 +180,8 @@ def made_again() -> Iterator[str]:
 
 def long_constructors() -> Iterator[str]:
     """Yield the package's own classes that are made of too many things."""
-    for name, nodes in NODES.items():
-        for node in nodes:
+    for name in PATHS:
+        for node in nodes_of(name):
             if not isinstance(node, ast.ClassDef) or node.name in PUBLIC_PROBLEMS:
                 continue
             for method in node.body:
