@@ -249,47 +249,65 @@ private:
   std::vector<double> blocks_;
 };
 
-// The gradients of the background basis that the single points of a group's domains see.
+// The gradients of the background basis that the single points of a group's domains see: made for
+// the whole group, as rows of T are far from each other in memory and are fetched ahead this way.
 template <int dim>
 class BackgroundGradients
 {
 public:
-  BackgroundGradients(const Domains& domains, const Rows& rows, const Support& support)
-      : domains_(domains), rows_(rows), support_(support), slot_(rows.num_nodes)
+  static constexpr int stride = Line<dim>::length;
+
+  BackgroundGradients(const Domains& domains, const Rows& rows, const Groups& groups,
+                      const Support& support)
+      : domains_(domains), rows_(rows), groups_(groups), support_(support), place_(rows.num_nodes)
   {
   }
 
   void begin(std::size_t group)
   {
+    using V = typename Line<dim>::type;
+    std::size_t size = 0;
+    for_each_domain_of(groups_, group, [&](std::size_t p) { size += size_of(support_, p); });
+    sums_.assign(size * stride, 0.0);
+    next_ = sums_.data();
     const std::int32_t* nodes = support_.nodes + support_.ends[group];
-    const std::size_t width = width_of(support_, group);
-    for (std::size_t slot = 0; slot < width; ++slot)
-      slot_[nodes[slot]] = static_cast<std::uint16_t>(slot);
-    gradients_.resize(width * dim);
+    std::uint16_t* const place = place_.data();
+    double* out = sums_.data();
+    for_each_domain_of(groups_, group, [&](std::size_t p) {
+      const std::uint16_t* slots = support_.slots + support_.offsets[p];
+      const std::size_t its = size_of(support_, p);
+      for (std::size_t a = 0; a < its; ++a)
+        place[nodes[slots[a]]] = static_cast<std::uint16_t>(a);
+      for (int c = 0; c < domains_.nodes; ++c)
+      {
+        V gradient = {};
+        for (int J = 0; J < dim; ++J)
+          gradient[J] = domains_.gradients[(p * domains_.nodes + c) * dim + J];
+        const std::int32_t row = domains_.dofmap[p * domains_.nodes + c];
+        const std::int64_t end = rows_.offsets[row + 1];
+        for (std::int64_t e = rows_.offsets[row]; e < end; ++e)
+          *reinterpret_cast<V*>(out + place[rows_.nodes[e]] * stride) += rows_.values[e] * gradient;
+      }
+      out += its * stride;
+    });
   }
 
-  // Those of a domain, by the slots of its nodes.
-  const double* of(std::size_t p)
+  // Those of the group's next domain, one for each node that it sees, at a stride.
+  const double* next(std::size_t p)
   {
-    for (std::int64_t e = support_.offsets[p]; e < support_.offsets[p + 1]; ++e)
-      std::fill_n(gradients_.data() + support_.slots[e] * dim, dim, 0.0);
-    for (int c = 0; c < domains_.nodes; ++c)
-    {
-      const std::int32_t row = domains_.dofmap[p * domains_.nodes + c];
-      const double* gradient = domains_.gradients + (p * domains_.nodes + c) * dim;
-      for (std::int64_t e = rows_.offsets[row]; e < rows_.offsets[row + 1]; ++e)
-        for (int J = 0; J < dim; ++J)
-          gradients_[slot_[rows_.nodes[e]] * dim + J] += rows_.values[e] * gradient[J];
-    }
-    return gradients_.data();
+    const double* its = next_;
+    next_ += size_of(support_, p) * stride;
+    return its;
   }
 
 private:
   const Domains& domains_;
   const Rows& rows_;
+  const Groups& groups_;
   const Support& support_;
-  std::vector<std::uint16_t> slot_; // of the group's nodes
-  std::vector<double> gradients_;
+  std::vector<std::uint16_t> place_; // of nodes among those that a domain sees
+  std::vector<double> sums_;
+  const double* next_ = nullptr;
 };
 
 // Room for the products of one domain.
@@ -579,7 +597,25 @@ std::vector<std::uint8_t> core::seen_pairs(const Groups& groups, const Support& 
   return result;
 }
 
-HOT_LOOP void core::assemble_points(const Domains& domains, const Rows& rows, const double* A,
+void core::support_gradients(const Domains& domains, const Rows& rows, const Groups& groups,
+                             const Support& support, double* gradients)
+{
+  with_dimension(domains.dim, [&](auto constant) {
+    constexpr int dim = constant;
+    BackgroundGradients<dim> made(domains, rows, groups, support);
+    for (std::size_t g = 0; g < groups.count; ++g)
+    {
+      made.begin(g);
+      for_each_domain_of(groups, g, [&](std::size_t p) {
+        std::copy_n(made.next(p), size_of(support, p) * made.stride,
+                    gradients + support.offsets[p] * made.stride);
+      });
+    }
+  });
+}
+
+HOT_LOOP void core::assemble_points(const Domains& domains, const Rows& rows,
+                                    const double* support_gradients, const double* A,
                                     bool symmetric, const Target& target)
 {
   with_dimension(domains.dim, [&](auto constant) {
@@ -587,25 +623,28 @@ HOT_LOOP void core::assemble_points(const Domains& domains, const Rows& rows, co
     constexpr int stride = Line<dim>::length;
     const Support& support = target.row;
     GroupBlocks<dim, dim, stride> blocks(target);
-    BackgroundGradients<dim> gradients(domains, rows, support);
+    BackgroundGradients<dim> made(domains, rows, target.groups, support);
     for (std::size_t g = 0; g < target.groups.count; ++g)
     {
       blocks.begin(g);
-      gradients.begin(g);
+      if (support_gradients == nullptr)
+        made.begin(g);
       for_each_domain_of(target.groups, g, [&](std::size_t p) {
         PointTangent<dim> tangent(A + p * dim * dim * dim * dim, domains.weights[p]);
         const std::size_t size = size_of(support, p);
         const std::uint16_t* slots = support.slots + support.offsets[p];
-        const double* S = gradients.of(p);
+        const double* S = support_gradients == nullptr
+                              ? made.next(p)
+                              : support_gradients + support.offsets[p] * stride;
         for (std::size_t a = 0; a < size; ++a)
         {
-          tangent.contract(S + slots[a] * dim);
+          tangent.contract(S + a * stride);
           for (std::size_t b = symmetric ? a : 0; b < size; ++b)
           {
             double* out = blocks(slots[a], slots[b]);
             for (int i = 0; i < dim; ++i)
               *reinterpret_cast<typename Line<dim>::type*>(out + i * stride)
-                  += tangent.line(i, S + slots[b] * dim);
+                  += tangent.line(i, S + b * stride);
           }
         }
       });

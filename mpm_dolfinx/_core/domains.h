@@ -84,6 +84,11 @@ Supports supports(const Dofmap& dofmap, const Rows& rows, const std::int32_t* or
 void local_transfers(const Dofmap& dofmap, const Rows& rows, const Groups& groups,
                      const Support& support, double* transfers);
 
+// The gradients of the background basis that a domain's single point sees: (support size, 2) in the
+// plane, (support size, 4) in space.
+void support_gradients(const Domains& domains, const Rows& rows, const Groups& groups,
+                       const Support& support, double* gradients);
+
 // Whether a domain of a group sees both nodes, for each pair of a node of its rows and one of its
 // columns.
 std::vector<std::uint8_t> seen_pairs(const Groups& groups, const Support& rows,
@@ -122,9 +127,10 @@ struct Target
   double* values[3];          // inside, outside, of rows of other ranks
 };
 
-// Add w S^T A S for domains of one point, with the gradients S = T^T G of the background basis.
-void assemble_points(const Domains& domains, const Rows& rows, const double* A, bool symmetric,
-                     const Target& target);
+// Add w S^T A S for domains of one point, with the gradients S of the background basis, which are
+// made on the way where they are not given.
+void assemble_points(const Domains& domains, const Rows& rows, const double* support_gradients,
+                     const double* A, bool symmetric, const Target& target);
 
 // Add T^T (sum_q w_q G^T A G + sum_m a_m b_m^T) T with the vectors a_1, b_1, a_2, ... of each
 // domain in vectors, (count, 2 pairs, nodes, dim).

@@ -536,6 +536,20 @@ NB_MODULE(_loops, m)
         "dofmap"_a, "offsets"_a, "nodes"_a, "values"_a, "groups"_a, "support"_a,
         "transfers"_a.noconvert(), "Set the values of T of each domain's nodes.");
 
+  m.def("support_gradients",
+        [](Indices dofmap, Reals gradients, Offsets offsets, Indices nodes, Reals values,
+           const GroupArrays& groups, const SupportArrays& support, RealsOut result) {
+    const Domains domains = domains_of(dofmap, gradients, nullptr);
+    require(domains.points == 1 && domains.dim == 2
+                && result.size() == std::get<1>(support).size() * 2,
+            "gradients of domains with one point in the plane");
+    support_gradients(domains, rows_of(offsets, nodes, values), groups_of(groups),
+                      support_of(groups, support), result.data());
+  },
+        "dofmap"_a, "gradients"_a, "offsets"_a, "nodes"_a, "values"_a, "groups"_a, "support"_a,
+        "result"_a.noconvert(),
+        "Set the gradients of the background basis at each domain's single point.");
+
   m.def("seen_pairs",
         [](const GroupArrays& groups, const SupportArrays& rows, const SupportArrays& columns) {
     return to_numpy(
@@ -636,16 +650,22 @@ NB_MODULE(_loops, m)
 
   m.def("assemble_points",
         [](Indices dofmap, Reals gradients, Reals weights, Offsets offsets, Indices nodes,
-           Reals values, Reals A, bool symmetric, const Where& where) {
+           Reals values, Reals support_gradients, Reals A, bool symmetric, const Where& where) {
     const Domains domains = domains_of(dofmap, gradients, &weights);
     const int square = domains.dim * domains.dim;
     require(domains.points == 1 && A.size() == domains.count * square * square,
             "A (n, dim, dim, dim, dim) of domains with one point");
-    assemble_points(domains, rows_of(offsets, nodes, values), A.data(), symmetric,
-                    target_of(where));
+    const Target target = target_of(where);
+    const auto size = static_cast<std::size_t>(target.row.offsets[domains.count]) * 2;
+    const bool given = support_gradients.size() > 0;
+    require(!given || (domains.dim == 2 && support_gradients.size() == size),
+            "gradients of the background basis in the plane, or none");
+    assemble_points(domains, rows_of(offsets, nodes, values),
+                    given ? support_gradients.data() : nullptr, A.data(), symmetric, target);
   },
-        "dofmap"_a, "gradients"_a, "weights"_a, "offsets"_a, "nodes"_a, "values"_a, "A"_a,
-        "symmetric"_a, "where"_a, "Add the reduced tangents of domains with one point.");
+        "dofmap"_a, "gradients"_a, "weights"_a, "offsets"_a, "nodes"_a, "values"_a,
+        "support_gradients"_a, "A"_a, "symmetric"_a, "where"_a,
+        "Add the reduced tangents of domains with one point.");
 
   m.def("assemble_domains",
         [](Indices dofmap, Reals gradients, Reals weights, Reals hoop, Reals transfers, Reals A,

@@ -101,12 +101,17 @@ class BodyLoops:
         first = _compat.geometry_dofmap(body)[: len(particles.domain_nodes), 0]
         order = morton_order(body.geometry.x[first, : body.geometry.dim])
         self.support = Support(particles.domain_nodes, order)
-        self._rows = no_rows
+        self._rows, self._gradients = no_rows, no_values
         self.transfers: NDArray[np.float64] = no_values
 
     def transfer(self, rows: TransferRows) -> None:
         """Take over the values of T."""
         self._rows = rows
+        gdim, size = self._domains[1].shape[-1], len(self.support.nodes[1])
+        if self._points and gdim == 2:  # in space they would be a tenth of all that a run keeps
+            self._gradients = np.empty((size, gdim))
+            given = (*self._domains, *rows, self.support.groups, self.support.nodes)
+            loops.support_gradients(*given, self._gradients)
         if self._whole:
             self.transfers = self.support.transfers(rows)
 
@@ -141,6 +146,7 @@ class BodyLoops:
                 *self._domains,
                 self._counted(internal.strain.weights),
                 *self._rows,
+                self._gradients,
                 internal.tangent,
                 internal.symmetric,
                 where,
