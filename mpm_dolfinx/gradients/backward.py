@@ -35,7 +35,7 @@ from ..materials.base import State
 from ..parallel.magnitudes import norm
 from ..problems.quasistatic import QuasiStaticProblem
 from ..solvers.newton import NewtonSolver
-from ..tolerances import ROUND_OFF
+from ..tolerances import ROUND_OFF, SMALL
 from .laws import Laws
 from .nearby import add_product, varying, without_tangents
 from .slopes import Slopes
@@ -43,9 +43,6 @@ from .slopes import Slopes
 __all__ = ["Backward", "Record", "Weights", "copied", "no_weights"]
 
 type Array = NDArray[np.float64]
-
-#: What a residual may be when a step is gone through again, relative to the forces.
-AGAIN = 1e-6
 
 
 class Record(NamedTuple):
@@ -157,7 +154,7 @@ class Backward:
         if (failure := reduced.balance.evaluate()) is not None:
             raise failure
         rest = norm(reduced.unknowns.restricted(reduced.unknowns.forces))
-        if rest > AGAIN * reduced.scale() and rest > AGAIN * reduced.balance.internal_scale():
+        if rest > SMALL * reduced.scale() and rest > SMALL * reduced.balance.internal_scale():
             raise MPMError(
                 "A step that an Adjoint goes through again is no equilibrium: what the forms hold "
                 "has changed, other than Constants, loads and parameters of materials."
