@@ -204,7 +204,7 @@ class Judge:
         forces, inside = max(self.scale, self.first), problem.balance.internal_scale
         if left > HALF_DIGITS * forces and left > HALF_DIGITS * inside():
             share = left / forces if forces > 0.0 else np.inf
-            loose = mechanism(problem.resistance, self._factor, step)
+            loose = mechanism(problem.resistance, problem.levels, self._factor, step)
             if loose is None:
                 raise ConvergenceError(
                     f"Newton's method cannot balance {share:.1e} of the forces, as round-off of "
@@ -230,7 +230,7 @@ class Judge:
         if share <= SLIGHT:
             return
         problem = self._problem
-        loose = mechanism(problem.resistance, self._factor, y)
+        loose = mechanism(problem.resistance, problem.levels, self._factor, y)
         if loose is not None:
             raise not_held(problem.resistance, problem.levels, self._factor, loose, share)
         self.refine()

@@ -10,23 +10,27 @@ import numpy as np
 
 from ..errors import ConvergenceError, MPMError
 from ..parallel.magnitudes import norm
-from ..tolerances import LAST_PLACES, LOCAL_ITERATIONS, SMALL
+from ..tolerances import LAST_PLACES, LOCAL_ITERATIONS, SLIGHT, SMALL
 from .linear import ShiftedFactor
 from .problem import Levels, Resisting
 
 __all__ = ["mechanism", "not_held"]
 
 
-def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.Vec | None:
+def mechanism(
+    system: Resisting, levels: Levels, factor: ShiftedFactor, y: PETSc.Vec
+) -> PETSc.Vec | None:
     """Return a motion that the proximal term holds in y and nothing else does, if there is one.
 
     Solving for the forces of that term, again and again, leaves what gives way to them most;
     the stiffness along it tells a soft body, or a stiff one on a soft one, from a motion
     without any. That of values that are no displacements is the sum of terms that cancel, and
-    known to the last places of the tangent only.
+    known to the last places of the tangent only. Where stiffnesses differ by many digits that
+    motion is found to a few only, and a rigid one is looked at by itself.
 
     Args:
         system: What resists.
+        levels: The unknowns.
         factor: The factor of its tangent, with the proximal term's diagonal D.
         y: A step of the unknowns.
     """
@@ -47,7 +51,8 @@ def mechanism(system: Resisting, factor: ShiftedFactor, y: PETSc.Vec) -> PETSc.V
         if ratio <= SMALL or (ratio <= last_places and system.field_of(mode) is not None):
             return mode
         if ratio > 0.95 * before:
-            return None
+            loose = ratio <= SLIGHT and _all_move_rigidly(system, levels, factor)
+            return mode if loose else None
         before = ratio
     return None
 
