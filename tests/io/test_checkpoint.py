@@ -505,7 +505,7 @@ def drained(law):
     ("law", "other"),
     [
         (of_fracture(), of_fracture(model="AT2")),
-        (of_fracture(), of_fracture(split="spectral")),
+        (of_fracture(), of_fracture(split="volumetric")),
         (of_fracture(), of_fracture("NeoHooke")),
         (drained("MohrCoulomb"), drained("DruckerPrager")),
         (

@@ -209,11 +209,12 @@ def test_problems_leave_no_communicator():
     free = free_communicators()
     for kind in KINDS:
         run(kind, 3)
-    if (left := free_communicators()) == free:
+    if (left := free_communicators()) >= free:
         return
     leaks = {}
     for kind in KINDS:
         run(kind, 3)
         free, left = left, free_communicators()
         leaks[kind] = (free - left) / 3
-    pytest.fail(f"Communicators that a problem leaves: {leaks}")
+    # (what one of the run before had left to the garbage collector is not of a kind)
+    assert not any(leaks.values()), f"Communicators that a problem leaves: {leaks}"

@@ -49,9 +49,10 @@ def test_forces_that_cohesion_tells_balance(number):
 
 
 def test_scenes_are_the_same_each_time():
-    for number in quick():
+    numbers = generator.numbers()
+    assert len(numbers) >= 500
+    for number in list(numbers)[::8]:
         assert generator.scene(number) == generator.scene(number)
-    assert len(generator.numbers()) >= 500
 
 
 @pytest.mark.parametrize(
