@@ -237,4 +237,4 @@ def test_motion_and_water_are_the_same_on_any_number_of_ranks():
         found.append([in_order(*pair) for pair in pairs])
     for one, other in zip(*found, strict=True):
         gaps = np.abs(one - other).max(axis=(0, 1, 2))
-        assert (gaps < 1e-7 * np.abs(other).max(axis=(0, 1, 2))).all(), gaps
+        assert (gaps < 1e-8 * np.abs(other).max(axis=(0, 1, 2))).all(), gaps
