@@ -374,7 +374,7 @@ def test_the_tangent_is_that_of_the_forces(kind, cells, gdim, law, axisymmetric)
     layout = Layout(CORNERS[:, :gdim], np.array(cells), kind)
     count = 1 if isinstance(law, Bar) else 2
     rule = rule_of(layout, layout.nodes, count, axisymmetric)
-    x = layout.nodes + 0.3 * np.random.default_rng(1).standard_normal(layout.nodes.shape)
+    anyhow = 0.3 * np.random.default_rng(1).standard_normal(layout.nodes.shape)
     none, present = np.zeros(rule.weights.shape), np.ones(len(cells))
 
     def forces(x):
@@ -382,16 +382,25 @@ def test_the_tangent_is_that_of_the_forces(kind, cells, gdim, law, axisymmetric)
         np.add.at(total, layout.cells, nodal.forces)
         return total.ravel(), nodal.tangent
 
-    _, tangent = forces(x)
     dofs = (layout.cells[:, :, None] * gdim + np.arange(gdim)).reshape(len(cells), -1)
-    K, h = np.zeros((x.size, x.size)), 1e-6
-    for own, part in zip(dofs, tangent, strict=True):
-        K[np.ix_(own, own)] += part.reshape(len(own), len(own))
-    steps = [h * row.reshape(x.shape) for row in np.eye(x.size)]
-    by_differences = np.array([(forces(x + s)[0] - forces(x - s)[0]) / (2 * h) for s in steps]).T
-    assert np.allclose(K, by_differences, atol=1e-8 * np.abs(K).max())
-    assert np.allclose(K, K.T, atol=1e-13 * np.abs(K).max())
+    for x in (layout.nodes + anyhow, 1.2 * layout.nodes):  # (by equal stretches, too)
+        K, h = np.zeros((x.size, x.size)), 1e-6
+        for own, part in zip(dofs, forces(x)[1], strict=True):
+            K[np.ix_(own, own)] += part.reshape(len(own), len(own))
+        steps = [h * row.reshape(x.shape) for row in np.eye(x.size)]
+        slopes = np.array([(forces(x + s)[0] - forces(x - s)[0]) / (2 * h) for s in steps]).T
+        assert np.allclose(K, slopes, atol=1e-8 * np.abs(K).max())
+        assert np.allclose(K, K.T, atol=1e-13 * np.abs(K).max())
     assert np.abs(forces(layout.nodes)[0]).max() < 1e-14
+
+
+def test_means_over_a_cell_are_weighed():
+    layout = Layout(CORNERS, np.array([[0, 1, 2, 3]]), QUAD)
+    rule = rule_of(layout, layout.nodes, 2, False)
+    assert np.ptp(rule.weights) > 0.1 * rule.weights.max()
+    values = np.arange(rule.weights.size, dtype=float)
+    mean = np.average(values, weights=rule.weights[0])
+    assert rule.means(values[None, :, None]) == pytest.approx(mean, rel=1e-14)
 
 
 # -- With the rest ------------------------------------------------------------------------------
