@@ -101,7 +101,6 @@ class Adjoint:
         self._shear = self._shear_modes()
         self._records: list[Record] = []
         self._trial: Trial | None = None
-        self._reduced = problem.reduced
         parameters = [one.parameter for one in self._many]
         self._followed = Followed(problem, parameters, "An Adjoint")
         problem.trial.record(self)
@@ -253,7 +252,7 @@ class Adjoint:
             ):
                 body.restore(last.copy().reshape(-1, body.mesh.geometry.dim))
                 points.go_from(its)
-            self._reduced.unknowns.forget()
+            self.problem.reduced.unknowns.forget()
             self._trial.go_back()
         found = [one.result() for one in self._many]
         with agree(problem.bodies[0].mesh.comm):
@@ -334,7 +333,7 @@ class Adjoint:
         for sign in (1.0, -1.0):
             parameter.shift(sign * parameter.change)
             problem.renew_external()
-            sides.append(self._reduced.terms.last_nodal_forces())
+            sides.append(problem.reduced.terms.last_nodal_forces())
         parameter.shift(0.0)
         problem.renew_external()
         for motion, after, before in zip(moved, *sides, strict=True):
@@ -343,7 +342,8 @@ class Adjoint:
 
     def _add_penalties(self, backgrounds: Sequence[PETSc.Vec], totals: dict[int, Array]) -> None:
         """Add derivatives by the moduli of penalties."""
-        for number, (field, z) in enumerate(zip(self._reduced.fields, backgrounds, strict=True)):
+        pairs = zip(self.problem.reduced.fields, backgrounds, strict=True)
+        for number, (field, z) in enumerate(pairs):
             if field.acting.moduli is None:
                 continue
             own, slopes = np.array(field.acting.moduli), []
@@ -379,8 +379,8 @@ class Adjoint:
             for total, slope in zip(stiffened[place], first.stiffness[place], strict=True):
                 dofs = slice(0, body.num_local)
                 one.add_of_cells(body, (total * slope)[dofs])
-            field = self._reduced.unknowns.place(body)[0]
-            number = self._reduced.fields.index(field)
+            field = problem.reduced.unknowns.place(body)[0]
+            number = problem.reduced.fields.index(field)
             if number in penalised:
                 its = next(n for n, own in enumerate(field.bodies) if own is body)
                 mode, volume = self._shear[place]
