@@ -16,14 +16,7 @@ from ..errors import MPMError
 from ..parallel.exchange import RowExchange
 from .cells import coordinate_element, disconnected_mesh, input_cell_index, tags_from_nodes
 
-__all__ = ["Carrier", "Redistribution", "cell_centres", "neighbour_ranks"]
-
-
-def cell_centres(body: mesh.Mesh) -> NDArray[np.float64]:
-    """Return the mean of the corners of each owned cell, shape ``(n, gdim)``."""
-    count = body.topology.index_map(body.topology.dim).size_local
-    corners = body.geometry.x[_compat.geometry_dofmap(body)[:count]]
-    return np.asarray(corners[:, :, : body.geometry.dim].mean(axis=1))
+__all__ = ["Carrier", "Redistribution", "neighbour_ranks"]
 
 
 class Carrier:

@@ -17,7 +17,7 @@ import basix.ufl
 from dolfinx import fem, mesh
 
 from .. import _compat
-from ..errors import DomainDistortionError, MPMError, agree, name_particles
+from ..errors import DomainDistortionError, MPMError, agree, name_particles, not_with
 from ..meshes.boxes import BOX_CELLS
 from ..meshes.cells import cell_vertices, input_cell_index
 from ..meshes.jacobian_bound import JacobianBound
@@ -200,7 +200,8 @@ def validate_options(
     if not is_one_of(outside, ("error", "stop", "delete")):
         raise MPMError(f"Unknown policy outside={outside!r}; choose 'error', 'stop' or 'delete'.")
     if V is None and outside != "error":
-        raise MPMError(f"Finite elements have no background to leave; omit outside={outside!r}.")
+        elements = "finite elements, which have no background to leave"
+        raise not_with(f"outside={outside!r}", elements, "omit it")
 
 
 def validate_free(V: fem.FunctionSpace | None, method: str, on_distortion: str) -> None:

@@ -115,9 +115,8 @@ class _Water(Physics):
             MPMError: The body may lose particles.
         """
         if body.deletion is not None:
-            raise MPMError(
-                "Particles cannot be taken from a body with water, whose pressure lives at nodes."
-            )
+            water = "water, whose pressure lives at nodes"
+            raise not_with("Deletion of particles", water, "use outside='stop', and omit remove()")
         for known in before:
             if known.particles is body and known.field.W.mesh is body.mesh:
                 return known

@@ -202,11 +202,6 @@ class Subspace:
                 found.append([field])
         return [Subspace(group) for group in found]
 
-    @property
-    def prescribes(self) -> bool:
-        """Whether Dirichlet values change in the step that has begun."""
-        return any(field.prescribed.changes for field in self.fields)
-
     def restriction(
         self, bodies: Sequence[Particles | CarriedField]
     ) -> tuple[Restriction, tuple[int, int]]:

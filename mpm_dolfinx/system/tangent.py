@@ -71,11 +71,7 @@ class Tangent:
         self.mass_factor = 0.0
         self._numbering: Numbering | None = None
         pairs = [self._fused_on(one.host) for one in unknowns.subspaces]
-        self.loops = (
-            FusedTangent(unknowns.comm, pairs, self._numbered_couplings(), statistics)
-            if any(pairs)
-            else None
-        )
+        self.loops = FusedTangent(unknowns.comm, pairs, self._numbered_couplings(), statistics)
         self._made = _Made()
 
     # -- What the compiled loops reduce -----------------------------------------------------------
@@ -116,11 +112,10 @@ class Tangent:
             return
         self._numbering = numbering
         self._made = _Made()
-        if self.loops is not None:
-            subspaces = self._unknowns.subspaces
-            reduced = [one.restriction(self._reduced_on(one.host)) for one in subspaces]
-            its = [restriction for restriction, _ in reduced]
-            self.loops.restrict(its, reduced[0][1], release)
+        subspaces = self._unknowns.subspaces
+        reduced = [one.restriction(self._reduced_on(one.host)) for one in subspaces]
+        its = [restriction for restriction, _ in reduced]
+        self.loops.restrict(its, reduced[0][1], release)
 
     def masses(self, masses: Masses) -> tuple[PETSc.Mat | None, list[Particles]]:
         """Reduce the mass of bodies by the compiled loops, as far as these know them.
@@ -136,7 +131,7 @@ class Tangent:
         subspaces = self._unknowns.subspaces
         fused = [body for one in subspaces for body, _ in self._fused_on(one.host)]
         its = [(body, own) for body, own in masses if any(body is one for one in fused)]
-        if self.loops is None or not its:
+        if not its:
             return None, []
         return self.loops.weigh(its), [body for body, _ in its]
 
@@ -147,7 +142,7 @@ class Tangent:
         unknowns, made = self._unknowns, self._made
         with self._statistics.phase("assemble"):
             reduced = [term.reduced_tangents(unknowns.transfer) for term in self._terms]
-            whole = [] if self.loops is None else [self.loops.assemble(self.mass_factor)]
+            whole = self.loops.assemble(self.mass_factor)
             parts: list[PETSc.Mat] = []
             made.matrices = [
                 {} if term.coupling is not None else term.tangents() for term in self._terms
@@ -170,9 +165,8 @@ class Tangent:
             if not self._has_diagonal:
                 made.zeros = made.zeros or self._zeros_on_diagonal()
                 parts.append(made.zeros)
-            if self.loops is not None:
-                parts = [part for part in parts if not self.loops.add(part)]
-            return made.total.of(whole + parts)
+            parts = [part for part in parts if not self.loops.add(part)]
+            return made.total.of([whole, *parts])
 
     @property
     def _has_diagonal(self) -> bool:

@@ -244,7 +244,7 @@ def test_what_makes_no_sense():
         ({"quadrature_degree": 1}, "does not see all strains.*quadrature_degree=2"),
         ({"degree": 2, "quadrature_degree": 3}, "quadrature_degree=4 or more"),
         ({"degree": 4}, "must be 1, 2 or 3"),
-        ({"outside": "delete"}, "no background to leave"),
+        ({"outside": "delete"}, "'delete' does not go with finite elements"),
         ({"on_distortion": "split"}, "can be split"),
         ({"V": vectors(body)}, "or omit it for finite elements"),
     ):
