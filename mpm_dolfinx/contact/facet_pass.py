@@ -148,27 +148,48 @@ class FacetPass(Pass[Past, Meeting]):
 
     @override
     def columns(self) -> dict[str, NDArray[Any]]:
-        offset = self.state.memory.offset.reshape(self.told.gap.shape)
-        return super().columns() | {"offset": offset}
+        memory, shape = self.state.memory, self.told.gap.shape
+        kept: dict[str, NDArray[Any]] = {
+            "met": memory.facet + 1,
+            "closest": memory.closest + 1,
+            "place": memory.place,
+            "gap": memory.gap,
+            "within": memory.within,
+            "offset": memory.offset,
+        }
+        of_points = {name: part.reshape(*shape, *part.shape[1:]) for name, part in kept.items()}
+        return super().columns() | of_points
 
     @override
     def restore(self, columns: dict[str, NDArray[Any]]) -> None:
-        near, memory = self._around.near, self.state.memory
-        touched = columns["touches"].ravel()
-        anchors = columns["anchor"].reshape(-1, self.source.gdim)
-        which = np.flatnonzero(touched)
-        numbers, place = memory.facet.copy(), memory.place.copy()
-        found = near.closest(anchors[which], None, self._around.before, self._sides.reach)
+        """Take what was kept of points of which nothing is known yet.
+
+        Where anchors are in their places on the facets of then, these are taken as they were, to
+        the last digit. Where facets were split or changed, anchors are looked for.
+        """
+        near, corners, memory = self._around.near, self._around.before, self.state.memory
+        flat = {name: v.reshape(-1, *v.shape[2:]) for name, v in columns.items()}
+        numbers, place = flat["met"] - 1, flat["place"]
+        on, foot = near.find(numbers), np.full_like(flat["anchor"], np.inf)
+        N, _, _ = near.tabulate(place[on >= 0])
+        foot[on >= 0] = np.einsum("nk,nki->ni", N, corners[on[on >= 0]])
+        same = np.linalg.norm(foot - flat["anchor"], axis=1) <= self._sides.touch
+        lost = np.flatnonzero(flat["touches"] & ~same)
+        found = near.closest(flat["anchor"][lost], None, corners, self._sides.reach)
         there = found.facet >= 0
-        numbers[which[there]] = near.number[found.facet[there]]
-        place[which[there]] = found.place[there]
+        numbers = np.where(same, numbers, memory.facet)
+        numbers[lost[there]] = near.number[found.facet[there]]
+        place = np.where(same[:, None], place, memory.place)
+        place[lost[there]] = found.place[there]
         known = memory._replace(
-            touched=touched,
+            touched=flat["touches"],
             facet=numbers,
             place=place,
-            within=touched | memory.within,
-            offset=columns["offset"].ravel(),
-            anchors=anchors,
+            closest=np.where(same, flat["closest"] - 1, memory.closest),
+            gap=np.where(same, flat["gap"], memory.gap),
+            within=np.where(same, flat["within"], flat["touches"] | memory.within),
+            offset=flat["offset"],
+            anchors=flat["anchor"],
             friction=worn(columns.get("friction"), memory.friction),
         )
         self.state = Past(known, retold(self.state.outcome, columns))

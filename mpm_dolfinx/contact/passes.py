@@ -30,8 +30,8 @@ type Kept = dict[str, NDArray[Any]]
 #: Makes passes by the stiffnesses of the facets of each surface.
 type Maker = Callable[[Sequence[Array]], Sequence[Pass[Any, Any]]]
 
-#: What is kept of points that touch.
-TOUCHING = ("touches", "anchor", "offset", "friction", "slips", "pressure", "traction")
+#: What is kept of facets; the rest is of points that touch.
+OF_FACETS = ("area", "thickness", "stretch")
 
 
 class Passes:
@@ -258,9 +258,9 @@ class Passes:
             surface.restore(columns)
         self.settle(materials, anew=True)
         for each, columns in zip(self.every, kept, strict=False):
-            known = [name for name in TOUCHING if name in columns]
-            each.restore({name: each.source.of_column(columns[name]) for name in known})
-            each.source.take_stretch(each.source.of_column(columns["stretch"]))
+            at_points = {name: each.source.of_column(values) for name, values in columns.items()}
+            each.source.take_stretch(at_points["stretch"])
+            each.restore({name: v for name, v in at_points.items() if name not in OF_FACETS})
 
     def kept(self) -> list[Kept] | None:
         """Return the kept columns of each body; ``None``: the contact belongs to no problem."""
@@ -284,8 +284,9 @@ def both(one: Kept, other: Kept) -> Kept:
     """Return the values of two contacts as one: the second's where it alone has any or touches."""
     found: Kept = {}
     for name, values in one.items():
-        new = one["area"] == 0.0
-        if name in TOUCHING:
+        if name in OF_FACETS:
+            new = one["area"] == 0.0
+        else:
             new = other["touches"] & ~one["touches"]
         found[name] = values
         if name in other and other[name].shape == values.shape:

@@ -463,13 +463,19 @@ class ShapePass(Pass[ShapeMemory, Touch]):
     # -- What is kept ---------------------------------------------------------------------------
 
     @override
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return super().columns() | {"own anchor": self.state.anchor}
+
+    @override
     def restore(self, columns: dict[str, NDArray[Any]]) -> None:
-        memory = self.state
+        """Take what was kept, anchors in the frame of the shape if that is still the same one."""
+        memory, touched = self.state, columns["touches"][:, :, None]
         anchor = framed(self._shape, memory.pose, columns["anchor"])
-        touched = columns["touches"][:, :, None]
+        own = columns["own anchor"]
+        same = np.abs(own - anchor).max(axis=2, keepdims=True) <= self.source.touch
         self.state = replace(
             memory,
-            anchor=np.where(touched, anchor, memory.anchor),
+            anchor=np.where(touched, np.where(same, own, anchor), memory.anchor),
             outcome=retold(memory.outcome, columns),
             friction=worn(columns.get("friction"), memory.friction),
         )

@@ -13,6 +13,7 @@ import basix
 import ufl
 from dolfinx import fem, mesh
 
+from .. import _compat
 from ..errors import DomainDistortionError, agree
 from ..meshes.cells import equispaced_element, input_cell_index
 from ..meshes.jacobian_bound import JacobianBound, jacobians
@@ -120,6 +121,15 @@ class Geometry:
     def corners(self) -> NDArray[np.float64]:
         """Nodes of each domain, shape ``(n, k, gdim)``."""
         return np.asarray(self.nodes[self.domain_nodes])
+
+    @property
+    def mesh_nodes(self) -> NDArray[np.float64]:
+        """Nodes of the mesh's cells, shape ``(n, k, gdim)``: a mesh of these is the same one.
+
+        :attr:`corners` differ from them by round-off.
+        """
+        nodes = _compat.geometry_dofmap(self.mesh)[: self.num_local]
+        return np.asarray(self.mesh.geometry.x[nodes, : self.gdim])
 
     @cached_property
     def volumes(self) -> NDArray[np.float64]:

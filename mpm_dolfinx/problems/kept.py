@@ -76,7 +76,7 @@ def _columns_of(body: Particles) -> dict[str, Column]:
         columns |= undeformed.reference.columns()
         columns["mass share"] = Column(undeformed.mass_shares(), "nodes")
     if undeformed.origin is not None:
-        columns["mesh nodes"] = Column(body.geometry.corners, "nodes")
+        columns["mesh nodes"] = Column(body.geometry.mesh_nodes, "nodes")
     return columns
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import obstacles
 import pytest
 import scenes
-from compare import error_of_blocks, outcome, same_run
+from compare import EXACT, error_of_blocks, outcome, same_run
 from obstacles import (
     CONFINED,
     POISSON,
@@ -221,6 +221,7 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     close(before, told(again), 1e-11)
     other.solve(10, update=path)
     close(told(die), told(again), 1e-8)
+    same_run(outcome(other), outcome(problem), EXACT)
     third, _, _ = dragged()
     with pytest.raises(mpm.MPMError, match=r"knows the contact .*nitsche.*here it is .*penalty"):
         third.restore(mpi_tmp_path / "half.ckpt")

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 import scenes
-from compare import error_of_a_term, outcome, same_run
+from compare import EXACT, error_of_a_term, outcome, same_run
 from marks import thinned
 from obstacles import on_plane
 from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_meshes, hertz, patch, spaces, two
@@ -215,6 +215,7 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     other.solve(8, update=path)
     end = problem.reaction(touch)
     assert np.abs(other.reaction(again) - end).max() < 1e-7 * np.abs(end).max()
+    same_run(outcome(other), outcome(problem), EXACT)
 
 
 @pytest.mark.slow
@@ -238,7 +239,7 @@ def test_a_pair_of_a_body_that_is_split_goes_on_from_a_checkpoint(mpi_tmp_path):
     other.solve(8, update=path)
     end = problem.reaction(touch)
     assert np.abs(other.reaction(again) - end).max() < 1e-9 * np.abs(end).max()
-    same_run(outcome(other), outcome(problem), 1e-9)
+    same_run(outcome(other), outcome(problem), EXACT)
 
 
 @pytest.mark.parametrize("passes", [1, 2])

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 import scenes
-from compare import error_of_blocks, outcome, same_run
+from compare import EXACT, error_of_blocks, outcome, same_run
 from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_meshes, hertz, patch, spaces, two
 from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
@@ -291,6 +291,7 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     other.solve(6, update=path)
     end = problem.reaction(touch)
     assert np.abs(other.reaction(again) - end).max() < 1e-7 * np.abs(end).max()
+    same_run(outcome(other), outcome(problem), EXACT)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import scenes
-from compare import outcome, same_run
+from compare import EXACT, outcome, same_run
 from marks import thinned
 from obstacles import (
     CONFINED,
@@ -230,7 +230,7 @@ def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     close(before, told(again), 1e-11)
     other.solve(10, update=path)
     close(told(die), told(again), 1e-8)
-    same_run(outcome(problem), outcome(other), 1e-9)
+    same_run(outcome(problem), outcome(other), EXACT)
     third, _, _ = dragged(friction=0.0)
     third.restore(mpi_tmp_path / "half.ckpt")  # another law is another run, not another state
 

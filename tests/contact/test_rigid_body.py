@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 import scenes
-from compare import breaks, error_of_a_term, outcome, raises, same_run
+from compare import EXACT, breaks, error_of_a_term, outcome, raises, same_run
 from marks import slow, thinned
 from posed import posed
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD, box
@@ -371,7 +371,7 @@ def test_a_checkpoint_in_an_impact_goes_on_as_the_run_does(mpi_tmp_path):
     other.solve(time=0.12, dt=0.02, output_at=[0.06])
     for name in ("offset", "angle", "velocity", "spin", "reaction"):
         assert np.abs(getattr(again, name) - getattr(ball, name)).max() < 1e-9, name
-    same_run(outcome(other), outcome(problem), 1e-9)
+    same_run(outcome(other), outcome(problem), EXACT)
 
 
 @pytest.mark.parametrize("scheme", ["midpoint", "euler"])
