@@ -11,8 +11,8 @@
 # out among two processes, where pytest-xdist is installed.
 #
 # Without --all, tests marked slow are left out, and several ranks run where they have something to do
-# with each other (between_ranks in tests/marks.py says which tests that are), more than two in the
-# rooms with the most of it. Arguments, such as a folder, are run in full on all ranks.
+# with each other (between_ranks in tests/marks.py says which tests that are), more than two where
+# these are the subject, in the rooms with the most of it. Arguments, such as a folder, are run in full on all ranks.
 set -uo pipefail
 
 cd "$(dirname "$0")/.." || exit 1
@@ -32,7 +32,7 @@ if [[ ${1:-} == --all ]]; then
     fi
 elif (($# == 0)); then
     several=(--between-ranks)
-    few=(parallel particles transfer physics/test_parallel.py problems/test_fields.py)
+    few=(parallel background meshes particles physics/test_parallel.py problems/test_fields.py)
     few=("${few[@]/#/tests/}")
     echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
         "NP=1 for one rank alone; make test-all runs all, also on four ranks."

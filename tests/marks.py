@@ -6,23 +6,26 @@ import re
 
 import pytest
 
-#: Of a family on several ranks: prime to the sizes of most products of parameters.
-EVERY = 11
-#: Whole runs, whose answers one rank has looked at, and how many of them several ranks do again.
+#: Of a family about ranks, how many sets of parameters more than two ranks run.
+MOST = 11
+#: What ranks do together besides solving: files, failures, other meshes, features with each other.
+TOGETHER = (
+    re.compile("checkpoint|restart|restore"),
+    re.compile("ends_on|fail|interrupt|signal"),
+    re.compile("mesh|repartition|split"),
+    re.compile("combination|feature|scene"),
+)
+#: Errors of what users give, which ranks agree on: all that is public is asked in tests/parallel.
+REFUSALS = re.compile("refuse|no_sense|what_cannot_be|not_go_together")
+#: Whole runs, whose answers one rank has looked at: what these are made of has tests of its own.
 WHOLE_RUNS = re.compile(
     r"tests/(boundary|constitutive|contact|gradients|plot|problems|solvers|stabilisation|stepping|"
     r"structures|system)/|/test_sections\.py"
 )
-SOME = 8
-#: What ranks do together in them: tests that say so stay.
-TOGETHER = re.compile(
-    "checkpoint|combination|ends_on|fail|feature|interrupt|mesh|no_sense|refuse|repartition|"
-    "restart|restore|signal|split"
-)
 #: Physics, texts that are read, arrays that each rank has for itself.
 ALONE = re.compile(
-    r"tests/(benchmarks|demos|docs|materials|physics)/|"
-    r"/test_(house|public_api|law|shapes|jacobian_bound)\.py"
+    r"tests/(benchmarks|demos|docs|materials|physics|stress)/|tests/test_|"
+    r"/test_(jacobian_bound|law|nearest|order|quadrature|shapes)\.py"
 )
 
 
@@ -54,12 +57,12 @@ def between_ranks(items, ranks):
     One rank has run everything. Several ranks run
 
     - what has ranks as its subject: files called ``parallel``, functions with ``rank`` in their
-      name, tests marked ``mpi``; two ranks all sets of parameters, more ``EVERY`` of each at most,
-    - of each other function one in ``EVERY`` of its sets of parameters: a ghost, a boundary between
+      name, tests marked ``mpi``; two ranks all sets of parameters, more ``MOST`` of each, and
+      nothing else,
+    - one set of parameters of each other function, which is no refusal: a ghost, a boundary between
       parts or a collective call does not know Poisson's ratio,
-    - in rooms of whole runs only one function in ``SOME``, and each that is about what ranks do
-      together, such as errors, files or other meshes: what runs are made of has its own tests,
-    - of physics, and of what a rank does for itself, only what is about ranks or such things.
+    - of a file of whole runs only the first function, and the first about each thing that ranks do
+      together; of physics, and of what a rank does for itself, only the latter.
 
     Args:
         items: The tests.
@@ -68,18 +71,19 @@ def between_ranks(items, ranks):
     Returns:
         The tests to run, and the others.
     """
-    chosen, others, functions, sets = [], [], {}, {}
+    chosen, others, sets, met = [], [], {}, set()
     for item in items:
         path, name = item.nodeid.split("::")[0], getattr(item, "originalname", item.name)
         place = sets[path, name] = sets.get((path, name), -1) + 1
         if "parallel" in path or "rank" in name or item.get_closest_marker("mpi"):
-            (others if ranks > 2 and place >= EVERY else chosen).append(item)
+            (others if ranks > 2 and place >= MOST else chosen).append(item)
             continue
-        left_out = place % EVERY
-        if not TOGETHER.search(name):
-            left_out = left_out or ALONE.search(path)
-            if WHOLE_RUNS.search(path):
-                names = functions.setdefault(path, {})
-                left_out = left_out or names.setdefault(name, len(names)) % SOME
-        (others if left_out else chosen).append(item)
+        things = {(path, k) for k, thing in enumerate(TOGETHER) if thing.search(name)}
+        if not ALONE.search(path):
+            things.add((path, "whole" if WHOLE_RUNS.search(path) else name))
+        if ranks > 2 or place or things <= met or REFUSALS.search(name):
+            others.append(item)
+        else:
+            met |= things
+            chosen.append(item)
     return chosen, others
