@@ -26,7 +26,7 @@ from petsc4py import PETSc
 import numpy as np
 import pytest
 from marks import between_ranks
-from programs import patient_compilers, remembered_forms, whole_forms
+from programs import patient_compilers, read_headers, remembered_forms, whole_forms
 
 comm = MPI.COMM_WORLD.Dup()
 
@@ -72,6 +72,7 @@ def pytest_configure(config: pytest.Config) -> None:
     with contextlib.ExitStack() as stack:
         if comm.rank == 0:
             stack.enter_context(whole_forms())
+            read_headers()
         comm.Barrier()
         stack.enter_context(patient_compilers())
         stack.enter_context(remembered_forms())

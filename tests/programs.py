@@ -8,8 +8,10 @@ import functools
 import importlib.util
 import json
 import os
+import shlex
 import subprocess
 import sys
+import sysconfig
 import tempfile
 from collections.abc import Iterator
 from importlib import metadata
@@ -40,6 +42,10 @@ def run(*arguments, cwd=None, **environment):
 #: Where tests keep compiled forms, apart from DOLFINx, where others that were killed meanwhile
 #: leave files for which FFCx waits.
 OWN = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mpm_dolfinx_tests"
+#: What each form includes, which compilers then read once: two fifths of their time.
+HEADERS = OWN / "headers.h"
+#: How forms of tests are compiled. Meshes have few cells: to optimise takes longer than it wins.
+FAST = ["-O0", "-g0"]
 #: The end of the name of FFCx's note that a module is ready.
 READY = ".c.cached"
 
@@ -63,33 +69,52 @@ def whole_forms(own: Path = OWN) -> Iterator[None]:
         yield
 
 
+def read_headers(headers: Path = HEADERS) -> None:
+    """Have the compiler keep what forms include as it has read it; one rank does this.
+
+    A compiler that finds nothing that fits its options reads the text.
+    """
+    headers.write_text("#include <Python.h>\n#include <math.h>\n#include <stdalign.h>\n", "utf-8")
+    known = sysconfig.get_config_vars()
+    compiler = " ".join([os.environ.get("CC") or known["CC"], known["CFLAGS"], known["CCSHARED"]])
+    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=headers.parent) as folder:
+        read = Path(folder, "read")
+        command = [*shlex.split(compiler), "-I", sysconfig.get_path("include"), "-std=c17", *FAST]
+        command += ["-x", "c-header", headers, "-o", read]
+        if subprocess.run(command, capture_output=True, check=False).returncode == 0:
+            read.replace(f"{headers}.gch")
+
+
 @contextlib.contextmanager
 def patient_compilers() -> Iterator[None]:
     """Have forms compiled fast, and waited for where another process does, also in what is started.
 
-    DOLFINx's ten seconds are short for several processes with an empty cache on a busy machine.
-    Meshes of tests have few cells: to optimise forms takes compilers longer than it wins. The
+    DOLFINx's ten seconds are short for several processes with an empty cache on a busy machine. The
     options are read from a file, to which what the user's own file says is added.
     """
     own = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    name = Path("dolfinx", "dolfinx_jit_options.json")
+    file = Path("dolfinx", "dolfinx_jit_options.json")
     options: dict[str, Any] = {"timeout": int(PATIENCE)}
-    options["cffi_extra_compile_args"] = ["-O0", "-g0"]
+    options["cffi_extra_compile_args"] = FAST
     with contextlib.suppress(OSError):
-        options |= json.loads((own / name).read_text("utf-8"))
+        options |= json.loads((own / file).read_text("utf-8"))
     options["cache_dir"] = str(OWN)
-    before = os.environ.get("XDG_CONFIG_HOME")
+    before = {name: os.environ.get(name) for name in ("XDG_CONFIG_HOME", "CPPFLAGS")}
+    include = f"-include {shlex.quote(str(HEADERS))}"
     with tempfile.TemporaryDirectory(prefix="mpm_dolfinx_") as folder:
-        path = folder / name
+        path = Path(folder) / file
         path.parent.mkdir()
         path.write_text(json.dumps(options), "utf-8")
         os.environ["XDG_CONFIG_HOME"] = folder
+        if HEADERS.exists():
+            os.environ["CPPFLAGS"] = f"{before['CPPFLAGS'] or ''} {include}"
         try:
             yield
         finally:
-            os.environ.pop("XDG_CONFIG_HOME")
-            if before is not None:
-                os.environ["XDG_CONFIG_HOME"] = before
+            for name, value in before.items():
+                os.environ.pop(name, None)
+                if value is not None:
+                    os.environ[name] = value
 
 
 def loaded(module_name, object_names, cache_dir):
