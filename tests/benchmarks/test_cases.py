@@ -25,6 +25,16 @@ LONG = {
     *("gradient", "hertz-pair", "weight-recommended", "circle-recommended", "incline", "sand"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     "indentation",
+    *(
+        "pipe",
+        "mandel",
+        "consolidation",
+        "cylinder",
+        "footing-recommended",
+        "embankment",
+        "softening",
+    ),
+    *("expansion", "taylor", "ironing", "wall-degree-1", "sphere-coarse", "structures-pull-out"),
     *("footing", "distortion", "ufl", "block-tet", "roller-tri", "free-quad", "free-domain"),
     *(
         "slope",

@@ -6,6 +6,7 @@ from mpi4py import MPI
 
 import numpy as np
 import pytest
+from marks import slow
 
 import ufl
 from dolfinx import fem, mesh
@@ -29,7 +30,7 @@ def body_of(degree, kind, dim):
 
 
 @pytest.mark.parametrize("axisymmetric", [False, True])
-@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("degree", [*slow(1), 2])
 @pytest.mark.parametrize("kind", ["quadrilateral", "triangle"])
 def test_average_is_that_of_finite_elements(kind, degree, axisymmetric):
     particles = body_of(degree, mesh.CellType[kind], 2)

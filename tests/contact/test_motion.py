@@ -359,7 +359,7 @@ def test_a_run_that_is_interrupted_leaves_everything_as_it_was():
 @pytest.mark.parametrize(
     ("scheme", "law", "passes"),
     [
-        ("conserving", "penalty", 2),
+        pytest.param("conserving", "penalty", 2, marks=pytest.mark.slow),
         pytest.param("midpoint", "penalty", 1, marks=pytest.mark.slow),
         pytest.param("euler", "penalty", 2, marks=pytest.mark.slow),
         ("euler", "nitsche", 2),

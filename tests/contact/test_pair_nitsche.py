@@ -352,6 +352,7 @@ def test_it_goes_with_implicit_euler():
     assert problem.reaction(touch)[1] == pytest.approx(4.0, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("passes", [1, pytest.param(2, marks=SLOW)])
 @pytest.mark.parametrize("steps", [20, pytest.param(60, marks=SLOW)])
 def test_an_impact_wins_no_energy(passes, steps):

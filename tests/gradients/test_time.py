@@ -198,7 +198,7 @@ class Warm:
 
 @pytest.mark.parametrize(
     ("at", "kind"),
-    [*thinned(2, [("nodes", "total"), ("nodes", "increment")]), ("points", "total")],
+    thinned(2, [("points", "total"), ("nodes", "total"), ("nodes", "increment")]),
 )
 def test_several_fields(at, kind):
     values = {"young": 10.0, "heat": 0.4, "spread": 0.2}

@@ -560,7 +560,7 @@ def test_nothing_is_refused_that_excludes_itself():
 
 
 @pytest.mark.parametrize("sixth", SIXTHS)
-@pytest.mark.parametrize("feature", FEATURES)
+@pytest.mark.parametrize("feature", all_but(list(FEATURES)[::2], FEATURES))
 @pytest.mark.filterwarnings("ignore:adapt=0.02 is not met")
 @pytest.mark.filterwarnings("ignore:The run is complete, but the domains")
 def test_a_feature_with_those_before_it(feature, sixth, mpi_tmp_path, monkeypatch):

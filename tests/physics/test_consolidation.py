@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from marks import slow
 from scenes import QUADRILATERAL, WORLD
 
 import ufl
@@ -78,7 +79,7 @@ def consolidate(n, sizes, **options):
     return np.sqrt(gap / whole), solves, y, p
 
 
-@pytest.mark.parametrize("settlement", [1e-3, 0.3])
+@pytest.mark.parametrize("settlement", [*slow(1e-3), 0.3])
 def test_consolidation_is_of_second_order(settlement):
     """Also where the body settles through cells of the background."""
     errors = [

@@ -82,7 +82,7 @@ def rubbing(cell, on_facets=True):
 
 @pytest.mark.parametrize(
     ("cell", "route"),
-    thinned(2, [(QUADRILATERAL, "loops"), (TRIANGLE, "loops"), (QUADRILATERAL, "reference")]),
+    thinned(3, [(QUADRILATERAL, "loops"), (TRIANGLE, "loops"), (QUADRILATERAL, "reference")]),
     indirect=["route"],
 )
 @pytest.mark.usefixtures("route")

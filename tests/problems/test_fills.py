@@ -78,7 +78,7 @@ def test_a_node_that_is_hardly_held_is_named(monkeypatch):
 
 @pytest.mark.parametrize(
     ("lifts", "rows", "cutoff"),
-    [*thinned(2, [(4, 1, None), (4, 1, 0.0), (4, 2, None), (3, 1, None)])],
+    [*thinned(3, [(4, 1, None), (4, 1, 0.0), (4, 2, None), (3, 1, None)])],
 )
 def test_lifts_are_built_by_default(lifts, rows, cutoff):
     """What next to nothing holds follows the cell below: none stops at a toe that is let loose."""

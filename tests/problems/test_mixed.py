@@ -824,7 +824,7 @@ def test_a_body_that_turns(scheme):
 
 @pytest.mark.parametrize(
     ("name", "scheme"),
-    thinned(3, [(name, scheme) for name in SOILS for scheme in ("midpoint", "conserving")]),
+    thinned(7, [(name, scheme) for name in SOILS for scheme in ("midpoint", "conserving")]),
 )
 def test_soil_that_turns_and_yields(name, scheme):
     """It gives next to nothing back, and moves as without a pressure, where nothing locks."""

@@ -130,6 +130,7 @@ def test_strength_is_divided(law):
             assert now == pytest.approx(value / 2.0)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The domains have 4")
 def test_slope_with_a_pressure_of_its_own():
     """Cells of H/4 do; the strength that was given comes back."""

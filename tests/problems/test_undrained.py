@@ -96,6 +96,7 @@ def test_strength_is_that_of_the_effective_stress_before():
     assert problem.points[0].last.yield_function().max() > -1e-6 * strength
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("poisson", "above"), thinned(2, [(0.495, 0.032), (0.4995, 0.007)]))
 def test_a_strip_bears_prandtl_s_load_of_that_strength(poisson, above):
     """In the recommended way to limit loads; water that gives way lets a part of the load in.

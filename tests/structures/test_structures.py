@@ -621,6 +621,7 @@ def factor_of_a_cut(nailed):
     return mpm.strength_reduction(problem, tolerance=0.05)
 
 
+@pytest.mark.slow
 def test_nails_hold_a_cut():
     bare, nailed = factor_of_a_cut(False), factor_of_a_cut(True)
     assert bare.reason == nailed.reason == "displacement"
@@ -649,6 +650,7 @@ def test_structures_are_written_and_drawn(tmp_path):
         assert len(np.unique(segments[0].get_colors(), axis=0)) > 2
 
 
+@pytest.mark.slow
 def test_structures_in_space_are_drawn():
     pytest.importorskip("pyvista")
     domain = box([0, 0, 0], [1, 1, 0.5], [2, 2, 1], HEXAHEDRON)

@@ -247,6 +247,7 @@ def bar(law, carried=False):
     return particles, law(toughness)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "carried", "dt"),
     [("midpoint", False, 0.01), pytest.param("euler", True, 0.02, marks=pytest.mark.slow)],
