@@ -24,6 +24,7 @@
 #include "domains.h"
 #include "material.h"
 #include "mean_stress.h"
+#include "products.h"
 #include "sparsity.h"
 #include "step_stress.h"
 
@@ -88,6 +89,18 @@ bool add_entries(const std::tuple<Array<const Index>, Array<const Index>, Reals>
     if (add)
       to[within][place] += values[e];
   });
+}
+
+// A matrix: offsets, columns and values of its rows.
+using RowArrays = std::tuple<Indices, Indices, Reals>;
+
+SparseRows sparse_rows(const RowArrays& arrays)
+{
+  const auto& [offsets, columns, values] = arrays;
+  require(offsets.size() > 0 && columns.size() == values.size()
+              && columns.size() == static_cast<std::size_t>(offsets.data()[offsets.size() - 1]),
+          "rows with columns and values");
+  return {offsets.size() - 1, offsets.data(), columns.data(), values.data()};
 }
 
 // The groups of domains: their order, and where groups begin in it.
@@ -647,6 +660,31 @@ NB_MODULE(_loops, m)
         "add"_a, of_entries);
   m.def("add_entries", add_entries<std::int64_t>, "entries"_a, "inside"_a, "outside"_a, "own"_a,
         "add"_a, of_entries);
+
+  m.def("equal_rows", [](const RowArrays& A) { return to_numpy(equal_rows(sparse_rows(A))); }, "A"_a,
+        "Return where rows begin that have the same columns, and the number of all rows.");
+
+  m.def("multiply", [](const RowArrays& A, Indices first, Reals x, RealsOut y) {
+    const SparseRows rows = sparse_rows(A);
+    require(y.size() == rows.count, "y of each row");
+    multiply(rows, first.data(), first.size(), x.data(), y.data());
+  }, "A"_a, "first"_a, "x"_a, "y"_a.noconvert(), "Set y to A x; first is what equal_rows returns.");
+
+  m.def("galerkin_pattern", [](const RowArrays& A, const RowArrays& P, std::size_t count) {
+    const SparseRows rows = sparse_rows(A), from = sparse_rows(P);
+    require(rows.count == from.count, "as many rows of A and P");
+    auto [offsets, columns] = galerkin_pattern(rows, from, count);
+    return std::make_pair(to_numpy(std::move(offsets)), to_numpy(std::move(columns)));
+  }, "A"_a, "P"_a, "count"_a, "Return offsets and columns of the rows of P^T A P.");
+
+  m.def("galerkin",
+        [](const RowArrays& A, const RowArrays& P, Indices offsets, Indices columns, RealsOut values) {
+    const SparseRows rows = sparse_rows(A), from = sparse_rows(P);
+    require(rows.count == from.count && columns.size() == values.size(), "A, P and their product");
+    galerkin(rows, from, {offsets.size() - 1, offsets.data(), columns.data(), nullptr},
+             values.data());
+  }, "A"_a, "P"_a, "offsets"_a, "columns"_a, "values"_a.noconvert(),
+        "Set the values of P^T A P, with the pattern that galerkin_pattern returns.");
 
   m.def("assemble_points",
         [](Indices dofmap, Reals gradients, Reals weights, Offsets offsets, Indices nodes,

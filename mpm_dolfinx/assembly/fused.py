@@ -17,6 +17,7 @@ from .._core import loops
 from ..history import Statistics
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
+from ..solvers.products import keep_rows
 from .blocks import Block, Coupled, Coupling, Masses, Restriction
 from .body_forms import BodyForms, no_values
 from .supports import BodyLoops
@@ -117,6 +118,7 @@ class FusedTangent:
             matrices[0] if self._comm.size == 1 else tuple(matrices),
             comm=self._comm,
         )
+        keep_rows(self._A, *matrices[0])
 
     def _entries(self, side: int, count: int) -> NDArray[np.float64]:
         """Return room for entries, that of the matrix before where it is large enough.

@@ -19,6 +19,7 @@ from ..parallel.totals import over_ranks
 from ..tolerances import HALF_DIGITS, INEXACT, SOLVED
 from .multigrid import Multigrid
 from .problem import Levels
+from .products import acting
 from .refinement import KRYLOV, Refinement
 from .refusals import options_refused, require_factor
 from .saddle import SaddleMultigrid
@@ -368,7 +369,7 @@ class ShiftedFactor:
                 matrix = self._shifted_copy(K, relative * levels.diagonal(K))
             if self._symmetric:
                 matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            self._ksp.setOperators(matrix if damped else K, matrix)
+            self._ksp.setOperators(acting(matrix if damped else K), matrix)
             self._multigrid.set(matrix)
             self._ksp.setUp()
         self.K, self.P = K, matrix
@@ -512,7 +513,7 @@ class ShiftedFactor:
             ksp.setType("fgmres")
             ksp.setGMRESRestart(KRYLOV)
             ksp.setPC(self._ksp.getPC())
-        ksp.setOperators(self.P, self.P)
+        ksp.setOperators(acting(self.P), self.P)
         ksp.setTolerances(rtol=rtol, atol=0.0, max_it=ITERATIONS)
         x.set(0.0)
         ksp.solve(b, x)

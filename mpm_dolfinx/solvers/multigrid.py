@@ -11,6 +11,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from ..tolerances import HALF_DIGITS
+from .products import acting, galerkin, keep_rows
 
 __all__ = ["Multigrid"]
 
@@ -49,6 +50,7 @@ class Multigrid:
         pc.setType("mg")
         pc.setMGLevels(count)
         for number, matrix in enumerate(self._interpolations):
+            keep_rows(matrix, *matrix.getValuesCSR())
             pc.setMGInterpolation(count - 1 - number, matrix)
         for level in range(1, count):
             smoother = pc.getMGSmoother(level)
@@ -68,16 +70,16 @@ class Multigrid:
         fine = K
         for number, P in enumerate(self._interpolations):
             if fresh:
-                self._products.append(fine.ptap(P))
+                self._products.append(galerkin(fine, P))
                 if self._symmetric:
                     self._products[-1].setOption(PETSc.Mat.Option.SYMMETRIC, True)
             else:
-                fine.ptap(P, result=self._products[number])
+                galerkin(fine, P, self._products[number])
             fine = self._products[number]
             _shift_diagonal(fine)
         for number, matrix in enumerate(reversed([K, *self._products])):
             solver = self._pc.getMGSmoother(number) if number else self._pc.getMGCoarseSolve()
-            solver.setOperators(matrix, matrix)
+            solver.setOperators(acting(matrix) if number else matrix, matrix)
             if number and fresh and K.comm.size > 1:
                 _damp(solver, matrix)
 
