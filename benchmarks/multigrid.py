@@ -32,6 +32,7 @@ from dolfinx.fem import petsc as fem_petsc
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.solvers.multigrid import Multigrid
+from mpm_dolfinx.solvers.products import acting
 
 PLANES = [(axis, 0.0) for axis in range(3)]
 COMM = MPI.COMM_WORLD
@@ -164,7 +165,7 @@ def tangent(problem: mpm.QuasiStaticProblem) -> dict[str, Any]:
         if not made:
             levels = problem.reduced.levels.interpolations(600)
             made.append(Multigrid(ksp.getPC(), levels, True))
-        ksp.setOperators(K, K)
+        ksp.setOperators(acting(K), K)
         made[0].set(K)
 
     entries = K.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"]

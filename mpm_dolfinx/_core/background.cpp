@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <cmath>
 #include <numeric>
+#include <type_traits>
 
 namespace
 {
@@ -133,3 +134,38 @@ core::transfer_rows(std::size_t, std::size_t, int, const std::int64_t*, const do
 template core::RowEntries<std::int64_t>
 core::transfer_rows(std::size_t, std::size_t, int, const std::int64_t*, const double*,
                     std::int64_t*);
+
+namespace
+{
+// Call f(point, node, value) for dim, as a constant, and all nodes of all points.
+template <typename F>
+void for_each_value(const core::Basis& T, F&& f)
+{
+  const auto run = [&](auto dim) {
+    for (std::size_t p = 0; p < T.count; ++p)
+      for (std::size_t e = p * T.k; e < (p + 1) * T.k; ++e)
+        f(dim, p * dim, T.nodes[e] * dim, T.values[e]);
+  };
+  if (T.dim == 2)
+    run(std::integral_constant<int, 2>());
+  else
+    run(std::integral_constant<int, 3>());
+}
+} // namespace
+
+void core::apply(const Basis& T, const double* x, double* y)
+{
+  std::fill(y, y + T.count * T.dim, 0.0);
+  for_each_value(T, [&](auto dim, std::size_t point, std::int64_t node, double value) {
+    for (int i = 0; i < dim; ++i)
+      y[point + i] += value * x[node + i];
+  });
+}
+
+void core::add_transposed(const Basis& T, const double* y, double* x)
+{
+  for_each_value(T, [&](auto dim, std::size_t point, std::int64_t node, double value) {
+    for (int i = 0; i < dim; ++i)
+      x[node + i] += value * y[point + i];
+  });
+}

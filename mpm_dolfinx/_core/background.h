@@ -54,4 +54,19 @@ struct RowEntries
 template <typename Index>
 RowEntries<Index> transfer_rows(std::size_t count, std::size_t k, int bs,
                                 const std::int64_t* nodes, const double* values, Index* offsets);
+
+// Values of k nodes of the background at points, for dim components: T as it is found.
+struct Basis
+{
+  std::size_t count, k;
+  int dim;
+  const std::int64_t* nodes; // (count, k)
+  const double* values;
+};
+
+// Set y to T x.
+void apply(const Basis& T, const double* x, double* y);
+
+// Add T^T y to x.
+void add_transposed(const Basis& T, const double* y, double* x);
 } // namespace core

@@ -476,6 +476,16 @@ auto rows_of_transfer(Offsets nodes, Reals values, int bs, Array<Index> offsets)
   return std::make_pair(to_numpy(std::move(found.columns)), to_numpy(std::move(found.values)));
 }
 
+// T as it is found at points, with vectors of points and of the background.
+Basis basis_of(Offsets nodes, Reals values, std::size_t points, std::size_t background)
+{
+  require(nodes.ndim() == 2 && values.size() == nodes.size(), "nodes and values (n, k)");
+  const std::size_t count = nodes.shape(0), dim = count == 0 ? 2 : points / count;
+  require(points == count * dim && (dim == 2 || dim == 3) && background % dim == 0,
+          "components of points and nodes");
+  return {count, nodes.shape(1), static_cast<int>(dim), nodes.data(), values.data()};
+}
+
 // A compiled form by the address of its kernel, with what it is given on its cells.
 using Compiled = std::tuple<std::uintptr_t, Indices, Reals, Reals, Reals, Indices>;
 
@@ -604,6 +614,13 @@ NB_MODULE(_loops, m)
         "offsets"_a.noconvert(), of_transfer);
   m.def("transfer_rows", rows_of_transfer<std::int64_t>, "nodes"_a, "values"_a, "bs"_a,
         "offsets"_a.noconvert(), of_transfer);
+
+  m.def("apply_basis", [](Offsets nodes, Reals values, Reals x, RealsOut y) {
+    apply(basis_of(nodes, values, y.size(), x.size()), x.data(), y.data());
+  }, "nodes"_a, "values"_a, "x"_a, "y"_a.noconvert(), "Set y to T x.");
+  m.def("add_transposed_basis", [](Offsets nodes, Reals values, Reals y, RealsOut x) {
+    add_transposed(basis_of(nodes, values, y.size(), x.size()), y.data(), x.data());
+  }, "nodes"_a, "values"_a, "y"_a, "x"_a.noconvert(), "Add T^T y to x.");
 
   m.def("pattern",
         [](Offsets row_offsets, Indices row_nodes, std::size_t num_rows, Offsets column_offsets,

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 import numpy as np
 
 from ..tolerances import HALF_DIGITS
-from .products import acting, galerkin, keep_rows
+from .products import acting, galerkin
 
 __all__ = ["Multigrid"]
 
@@ -50,7 +50,6 @@ class Multigrid:
         pc.setType("mg")
         pc.setMGLevels(count)
         for number, matrix in enumerate(self._interpolations):
-            keep_rows(matrix, *matrix.getValuesCSR())
             pc.setMGInterpolation(count - 1 - number, matrix)
         for level in range(1, count):
             smoother = pc.getMGSmoother(level)

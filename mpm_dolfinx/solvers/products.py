@@ -26,8 +26,8 @@ ROWS, ACTING = "mpm_dolfinx_rows", "mpm_dolfinx_acting"
 class _Rows(NamedTuple):
     """The arrays in which a matrix lives."""
 
-    offsets: NDArray[np.int32]
-    columns: NDArray[np.int32]
+    offsets: NDArray[np.integer]
+    columns: NDArray[np.integer]
     values: NDArray[np.float64]
 
 

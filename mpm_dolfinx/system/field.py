@@ -57,9 +57,15 @@ class Motion:
         """All dofs of W by all dofs of V."""
         return self._moved.T
 
+    @property
+    def action(self) -> PETSc.Mat:
+        """What multiplies as T does."""
+        moved = self._moved
+        return moved.transfer.action if isinstance(moved, Particles) else moved.T
+
     def begin(self) -> None:
         """Take over the present transfer."""
-        self._work = self.T.createVecLeft()
+        self._work = self.action.createVecLeft()
         self._rows = self._own_rows()
         self._free_T: tuple[PETSc.Mat, PETSc.Mat] | None = None
 
@@ -79,7 +85,7 @@ class Motion:
 
     def move(self, u: PETSc.Vec) -> None:
         """Set ``d = d_n + T u`` in the rows that are u's."""
-        self.T.mult(u, self._work)
+        self.action.mult(u, self._work)
         d, own = self.particles.displacement.x, self._work.getLocalSize()
         self._before = self.particles.converged_displacement[:own]
         moved = self._before + self._work.array_r
@@ -100,7 +106,7 @@ class Motion:
 
     def of(self, u: PETSc.Vec) -> PETSc.Vec:
         """Return ``T u``, in a vector that the next call changes."""
-        self.T.mult(u, self._work)
+        self.action.mult(u, self._work)
         return self._work
 
     def extent(self) -> float:
@@ -386,5 +392,6 @@ class Field:
         assert self.free is not None
         fit = fit and all(body.shares_nodes for body in self.bodies)
         positive = self.V.ufl_element().degree == 1
-        u = map_to_background([motion.T for motion in self.motions], increments, fit, positive)
+        transfers = [motion.action if positive else motion.T for motion in self.motions]
+        u = map_to_background(transfers, increments, fit, positive)
         x.array_w[self.part] = self.free.collect(u[self.dofs]) / self.factor

@@ -24,6 +24,7 @@ from dolfinx import fem
 
 from ..background.grids import box_weights, cell_lines, coarser, grid_lines
 from ..meshes.boxes import BOX_CELLS
+from ..solvers.products import keep_rows
 from ..solvers.strategies import Coarsening
 from ..tolerances import NEGLIGIBLE
 from .numbering import FreeDofs
@@ -223,4 +224,6 @@ def _matrix(
         numbers[order].astype(PETSc.IntType),
         entries.values[order],
     )
-    return PETSc.Mat().createAIJ(((rows, None), (columns, None)), csr=csr, comm=comm)
+    matrix = PETSc.Mat().createAIJWithArrays(((rows, None), (columns, None)), csr, comm=comm)
+    keep_rows(matrix, *csr)
+    return matrix

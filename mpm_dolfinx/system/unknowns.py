@@ -229,7 +229,7 @@ class Unknowns:
         for body, vector in zip(bodies, vectors, strict=True):
             for field, motion in self.ways(body):
                 target = to[self.fields.index(field)]
-                motion.T.multTransposeAdd(vector, target, target)
+                motion.action.multTransposeAdd(vector, target, target)
 
     def at_nodes(self, bodies: Sequence[Body], vectors: Sequence[PETSc.Vec]) -> PETSc.Vec:
         """Return unknowns that have the values of vectors on bodies where they are these' nodes.

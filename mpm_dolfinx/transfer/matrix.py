@@ -16,7 +16,7 @@ from dolfinx import fem
 from .._core import loops
 from ..background.basis import PointBasis
 
-__all__ = ["transfer_matrix"]
+__all__ = ["transfer_action", "transfer_matrix"]
 
 
 def transfer_matrix(basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpace) -> PETSc.Mat:
@@ -40,6 +40,37 @@ def transfer_matrix(basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpac
         (columns.size_local * bs, columns.size_global * bs),
     )
     return PETSc.Mat().createAIJ(sizes, csr=csr, comm=W.mesh.comm)
+
+
+class _Action:
+    """Context of a PETSc matrix that acts as T does, by the basis at the nodes of W."""
+
+    def __init__(self, basis: PointBasis) -> None:
+        self._rows = basis.nodes, basis.values
+
+    def mult(self, _: PETSc.Mat, u: PETSc.Vec, d: PETSc.Vec) -> None:
+        """Set d to ``T u``."""
+        loops.apply_basis(*self._rows, u.array_r, d.array_w)
+
+    def multTranspose(self, _: PETSc.Mat, d: PETSc.Vec, u: PETSc.Vec) -> None:
+        """Set u to ``T^T d``."""
+        u.set(0.0)
+        loops.add_transposed_basis(*self._rows, d.array_r, u.array)
+
+    def multTransposeAdd(self, _: PETSc.Mat, d: PETSc.Vec, start: PETSc.Vec, u: PETSc.Vec) -> None:
+        """Set u to a start and ``T^T d``."""
+        if start != u:
+            start.copy(u)
+        loops.add_transposed_basis(*self._rows, d.array_r, u.array)
+
+
+def transfer_action(basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpace) -> PETSc.Mat:
+    """Return what multiplies as :func:`transfer_matrix` of one rank does, and has no entries.
+
+    Those take more memory than all else that is known of T.
+    """
+    sizes = [space.dofmap.index_map.size_global * space.dofmap.index_map_bs for space in (W, V)]
+    return PETSc.Mat().createPython(sizes, _Action(basis), comm=W.mesh.comm)
 
 
 def _entries(

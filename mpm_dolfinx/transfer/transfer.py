@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dolfinx import fem
 
-from .matrix import transfer_matrix
+from .matrix import transfer_action, transfer_matrix
 from .method import CornerBasis
 from .touched import TouchedNodes
 
@@ -43,6 +43,13 @@ class Transfer:
     def T(self) -> PETSc.Mat:
         """All dofs of W by all dofs of V (collective)."""
         return transfer_matrix(self.rows.basis, self._W, self._V)
+
+    @cached_property
+    def action(self) -> PETSc.Mat:
+        """What multiplies as T does (collective); on one rank T itself is not made for it."""
+        if self._W.mesh.comm.size > 1:
+            return self.T
+        return transfer_action(self.rows.basis, self._W, self._V)
 
     @cached_property
     def active_nodes(self) -> NDArray[np.int32]:

@@ -56,6 +56,27 @@ def test_T_by_functions_of_the_background(background, cell):
     np.testing.assert_allclose(scenes.gather(result.array_r.reshape(-1, dim)), expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(("background", "cell"), [PAIRS[0], SOLID[0]], ids=scenes.name)
+def test_what_acts_for_T_multiplies_as_it_does(background, cell):
+    transfer = scene(background, cell, True).transfer
+    T, action = transfer.T, transfer.action
+    assert (action is T) == (T.comm.size > 1)
+    u, d = T.createVecs()
+    u.array_w[:] = np.sin(1.0 + 1.7 * np.arange(u.getLocalSize()))
+    others = action.createVecLeft(), action.createVecRight()
+    T.mult(u, d)
+    action.mult(u, others[0])
+    np.testing.assert_allclose(others[0].array_r, d.array_r, atol=1e-14)
+    back, total, start = u.duplicate(), u.duplicate(), u.copy()
+    T.multTranspose(d, back)
+    action.multTranspose(d, others[1])
+    np.testing.assert_allclose(others[1].array_r, back.array_r, atol=1e-13)
+    action.multTransposeAdd(d, u, total)
+    np.testing.assert_allclose(total.array_r, (start + back).array_r, atol=1e-13)
+    action.multTransposeAdd(d, u, u)
+    np.testing.assert_allclose(u.array_r, total.array_r, atol=1e-14)
+
+
 @pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID], ids=scenes.name)
 def test_active_dofs_are_the_columns_of_T(background, cell):
     particles = scene(background, cell)
