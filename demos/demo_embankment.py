@@ -125,7 +125,7 @@ draw(axes["built"], strains, "built", "plastic strain, %")
 
 # What is left of safety is found by dividing the strength of clay and fill.
 
-found = mpm.strength_reduction(problem, step=0.1, tolerance=0.02, displacement=0.3)
+found = mpm.strength_reduction(problem, tolerance=0.02)
 strains = [
     100 * body.plastic_strain - strain
     for body, strain in zip(problem.particles, strains, strict=True)

@@ -71,7 +71,7 @@ factors = {}
 for name in ("without", "with"):
     problem = slope(name == "with")
     settled = problem.particles.displacement.x.array.copy()
-    found = mpm.strength_reduction(problem, step=0.2)
+    found = mpm.strength_reduction(problem)
     factors[name] = found.factor
 
     # How far the soil has moved since the reduction began.

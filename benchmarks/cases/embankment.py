@@ -6,8 +6,8 @@ Half of a bank 2 m high, 4 m wide from its axis to its shoulder and with slopes 
 clay with an undrained strength of 15 kPa that carries its own weight. The fill is placed in lifts,
 each in three steps, and after the last one the strength of all soil is reduced until no equilibrium
 is found. `built` says whether all lifts stand, `factor` is the factor of safety, `reason` why the
-reduction ended, and `curve` has factors and displacements. All by defaults, with averages over
-patches.
+reduction ended, and `curve` has factors, displacements and rates of strain. All by defaults, with
+averages over patches.
 """
 
 from itertools import pairwise
@@ -29,9 +29,6 @@ parser.add_argument("--line", type=kit.positive, default=1.0, help="distance of 
 parser.add_argument("--cell", type=kit.positive, help="size of domains, m; half that distance")
 parser.add_argument("--steps", type=kit.whole, default=3, help="steps of each lift")
 parser.add_argument("--tolerance", type=kit.positive, default=0.02, help="of the factor of safety")
-parser.add_argument(
-    "--limit", type=kit.positive, default=0.3, help="displacement that stands in the reduction, m"
-)
 args = parser.parse()
 
 comm, quadrilateral = MPI.COMM_WORLD, mesh.CellType.quadrilateral
@@ -94,7 +91,7 @@ try:
         for step in kit.progress(problem.steps(args.steps), args.steps, args):
             most = max(most, step.iterations)
         standing = number
-    found = mpm.strength_reduction(problem, tolerance=args.tolerance, displacement=args.limit)
+    found = mpm.strength_reduction(problem, tolerance=args.tolerance)
     factor, reason, curve = found.factor, found.reason, found.curve.tolist()
 except mpm.MPMError as error:
     failure = error

@@ -46,9 +46,6 @@ parser.add_argument(
 )
 parser.add_argument("--tolerance", type=kit.positive, default=0.01, help="of the factor of safety")
 parser.add_argument(
-    "--limit", type=kit.positive, default=2.0, help="displacement that stands, weight height^2/E"
-)
-parser.add_argument(
     "--steps", type=kit.whole, help="steps of the footing; 20, recommended 30, with weight 50"
 )
 parser.add_argument("--degree", type=int, choices=(1, 2), default=1, help="of the footing's basis")
@@ -347,8 +344,7 @@ try:
         factor = curve[-1][1]
     else:
         problem.solve(2)
-        limit = args.limit * weight * height**2 / young
-        found = mpm.strength_reduction(problem, tolerance=args.tolerance, displacement=limit)
+        found = mpm.strength_reduction(problem, tolerance=args.tolerance)
         scale = weight * height if law.parameters["friction_angle"] == 0.0 else 1.0
         factor = scale * found.factor
         curve = [(d, scale * f) for d, f in zip(found.displacements, found.factors, strict=True)]

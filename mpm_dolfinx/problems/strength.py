@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..constitutive.moduli import undeformed_tangent
 from ..errors import TRIAL_ERRORS, MPMError, ParticleOutsideError, warn
 from ..materials.base import StrainMaterial
 from ..parallel.boundary import collective
@@ -26,6 +25,10 @@ type Array = NDArray[np.float64]
 #: What says that there is no equilibrium, or none was found.
 FAILURES = (*TRIAL_ERRORS, ParticleOutsideError)
 
+#: Strain of what flows over the relative loss of strength. In a body at rest it is a few elastic
+#: strains. A slide goes on until its shape bears the weaker strength, by strains of the order of 1.
+FLOW = 0.1
+
 
 @dataclass(frozen=True)
 class StrengthReduction:
@@ -36,30 +39,38 @@ class StrengthReduction:
         above: The least factor for which none was found; infinite where none was tried.
         factors: The factors with equilibrium, in order.
         displacements: Largest displacement of a node since the reduction began, for each.
-        limit: Largest displacement that counted as equilibrium.
-        reason: Why there is none for ``above``: ``"displacement"``, there is one but beyond the
-            limit; ``"no convergence"``, where Newton's method failed, which says nothing of the
-            ground unless the curve is steep there; ``"most"``, the body bears the largest factor.
+        reason: Why there is none for ``above``: ``"flow"``, the body strains by more than a tenth
+            of the strength that it lost; ``"no convergence"``, where Newton's method failed, which
+            says nothing of the ground unless the body was about to flow; ``"most"``, the body bears
+            the largest factor.
         failure: What Newton's method failed with at ``above`` and where, if that is the reason.
-        curve: Factors with any equilibrium, in order, and the displacements there, those beyond
-            the limit too, shape ``(n, 2)``.
+        curve: Factors with any state, in order, the displacements there, and the rates of strain:
+            strain since the last equilibrium over the relative loss of strength, zero at factor 1;
+            those of bodies that flow too, shape ``(n, 3)``.
     """
 
     factor: float
     above: float
     factors: list[float] = field(default_factory=list)
     displacements: list[float] = field(default_factory=list)
-    limit: float = np.inf
-    reason: Literal["displacement", "no convergence", "most"] = "most"
+    reason: Literal["flow", "no convergence", "most"] = "most"
     failure: MPMError | None = None
-    curve: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    curve: Array = field(default_factory=lambda: np.zeros((0, 3)))
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A state that was found: how far the body has moved, and by how much what moves strained."""
+
+    way: float
+    strain: float
 
 
 class _Search:
     """Which factor is tried next, by what came of those before.
 
-    A factor at which Newton's method fails is tried again whenever a nearer one has stood, one that
-    moves the body too far is not.
+    A factor at which Newton's method fails is tried again whenever a nearer one has stood, one at
+    which the body flows is not.
 
     Args:
         step: First increment.
@@ -72,7 +83,7 @@ class _Search:
 
     def __init__(self, step: float, most: float) -> None:
         self.good, self.bad = 1.0, np.inf
-        self._step, self._most, self._too_far = step, most, np.inf
+        self._step, self._most, self._flows = step, most, np.inf
 
     def next(self) -> float:
         """Return the factor to try."""
@@ -82,22 +93,21 @@ class _Search:
 
     def stood(self, factor: float) -> None:
         """Go on from a factor, also to those at which Newton's method has failed."""
-        self.good, self.bad = factor, self._too_far
+        self.good, self.bad = factor, self._flows
 
-    def fell(self, factor: float, too_far: bool) -> None:
+    def fell(self, factor: float, flows: bool) -> None:
         """Go half as far from the last that stood."""
         self.bad, self._step = factor, 0.5 * (factor - self.good)
-        if too_far:
-            self._too_far = factor
+        if flows:
+            self._flows = factor
 
 
 @collective()
 def strength_reduction(
     problem: QuasiStaticProblem,
-    step: float = 0.1,
+    step: float = 0.05,
     tolerance: float = 0.01,
     most: float = 10.0,
-    displacement: float | None = None,
 ) -> StrengthReduction:
     """Find the factor by which the strength of a body can be divided until it slides (collective).
 
@@ -106,14 +116,18 @@ def strength_reduction(
     & Lane 1999). What was found is left in the problem: the body in the last state of equilibrium,
     which shows the slide, with the strength that it was given.
 
-    Geometry is followed, so a body that slides may find another equilibrium further down, and does
-    where its cells are coarse. The factor of safety of the body as it stands is found by a limit
-    of the displacement: a few times what it would settle elastically, for a slope of height H
-    about ``density gravity H^2 / young`` (Griffiths & Lane's diagrams have that unit). Newton's
-    method may also fail where there is equilibrium, most where soils do not dilate. So a factor
-    at which it has failed is tried again in smaller increments. One that moves the body too far is
-    not. The result tells which of the two ended the search, ``found.reason``, and there is a
-    warning where it was Newton's method, far below the limit.
+    Geometry is followed, so a body that slides finds other equilibria further down, as its shape
+    changes. They do not count. A body at rest that loses a hundredth of its strength gives way by
+    some hundredths of its elastic strains, one that slides by strains of about a hundredth. So the
+    body flows where its strain (``sqrt(2/3)`` of the norm, in the mean over the body with itself as
+    weight, which is that in the slide) grows by more than a tenth of the relative loss of strength.
+    The rule has no length, so how much ground is modelled does not matter. Ground so soft that
+    elastic strains come to hundredths flows a few per cent earlier than stiff one.
+
+    Newton's method may also fail where there is equilibrium, most where soils do not dilate. So a
+    factor at which it has failed is tried again in smaller increments. One at which the body flows
+    is not. The result tells which of the two ended the search, ``found.reason``, and there is a
+    warning where it was Newton's method, for a body that hardly gives way.
 
     Where something else ends it, Ctrl-C or an error in a function of yours, the body is left in the
     last state of equilibrium too, with the strength that it was given.
@@ -123,14 +137,10 @@ def strength_reduction(
 
     Args:
         problem: A problem at its whole load.
-        step: First increment of the factor; it is halved where there is no equilibrium.
+        step: First increment of the factor; it is halved where there is no equilibrium. In a long
+            one a body may begin to flow unseen, in up to a quarter of it.
         tolerance: Width to which the factor is found.
         most: A factor at which to stop, should the body hold.
-        displacement: Largest displacement, from the beginning of the reduction, that counts as
-            equilibrium; ``np.inf``: any. By default it is half the strain of the body's stress at
-            its modulus of shear, in the mean (of squares) over the body, times its extent, the mean
-            (geometric) of the sides of a box around it: for a slope some ``density gravity
-            H^2 / young``.
 
     Returns:
         The factor of safety and how it was found.
@@ -140,11 +150,10 @@ def strength_reduction(
             fails, its steps have a duration (PorousProblem, DynamicProblem), no material has a
             strength, or domains may be split.
     """
-    _require(problem, step, tolerance, most, displacement)
+    _require(problem, step, tolerance, most)
     start = [body.converged_displacement.copy() for body in problem.bodies]
-    limit = _elastic_displacement(problem) if displacement is None else float(displacement)
     search = _Search(float(step), float(most))
-    ways: dict[float, float] = {}
+    curve: dict[float, tuple[float, float]] = {}
     failures: dict[float, MPMError] = {}
     factor = 1.0
     try:
@@ -153,30 +162,33 @@ def strength_reduction(
         while True:
             for points in problem.points:
                 points.laws.weaken(factor)
-            found = _equilibrium(problem, start, limit)
+            loss = np.log(factor / search.good)
+            found = _equilibrium(problem, start, FLOW * (loss or step))
+            if factor == 1.0:
+                _require_rest(found, FLOW * step)
             if isinstance(found, MPMError):
                 failures[factor] = found
+                search.fell(factor, flows=False)
             else:
-                ways[factor] = found
-            if factor == 1.0:
-                _require_rest(found, limit)
-            if factor in ways and ways[factor] <= limit:
-                search.stood(factor)
-            else:
-                search.fell(factor, too_far=factor in ways)
+                rate = found.strain / loss if loss else 0.0
+                curve[factor] = found.way, rate
+                if rate <= FLOW:
+                    search.stood(factor)
+                else:
+                    search.fell(factor, flows=True)
             if search.bad - search.good <= tolerance or search.good >= most:
                 break
             factor = search.next()
     finally:
         for points in problem.points:
             points.laws.weaken(1.0)
-    result = _result(search, ways, failures, limit)
+    result = _result(search, curve, failures)
     if result.failure is not None:
-        _warn_if_far(problem, result)
+        _warn_if_at_rest(problem, result, curve[result.factor][1])
     return result
 
 
-def _require_rest(found: float | MPMError, limit: float) -> None:
+def _require_rest(found: _Found | MPMError, most: float) -> None:
     """Raise an error where a step at the present strength is not one of a body at rest."""
     if isinstance(found, MPMError):
         raise MPMError(
@@ -184,54 +196,45 @@ def _require_rest(found: float | MPMError, limit: float) -> None:
             f"failed, so that a factor would mean nothing: {found!s}",
             found.particles,
         ) from found
-    if found > limit:
+    if found.strain > most:
         raise MPMError(
             "strength_reduction() begins with a step at the present loads and strength, in which "
-            f"the body moves by {found:.3g}, beyond the limit {limit:.3g} of the displacement; let "
-            "it come to rest by problem.step(), or give displacement=."
+            f"the body moves by {found.way:.3g} and strains by {found.strain:.3g}, above {most:g}: "
+            "it flows; let it come to rest by problem.step(), or weaken it less."
         )
 
 
 def _result(
-    search: _Search, ways: dict[float, float], failures: dict[float, MPMError], limit: float
+    search: _Search, curve: dict[float, tuple[float, float]], failures: dict[float, MPMError]
 ) -> StrengthReduction:
     """Return the result, and why the search ended.
 
     Args:
         search: It.
-        ways: How far the body has moved where there was equilibrium.
+        curve: How far the body has moved, and the rate of its strain, where there was a state.
         failures: What there was in its place.
-        limit: Largest displacement that counts.
     """
-    reason: Literal["displacement", "no convergence", "most"] = "most"
+    reason: Literal["flow", "no convergence", "most"] = "most"
     failure = None
     if search.bad < np.inf:
-        # (a factor that failed may have moved the body too far when it was tried again)
-        failure = None if search.bad in ways else failures[search.bad]
-        reason = "displacement" if failure is None else "no convergence"
-    curve = np.array(sorted(ways.items())).reshape(-1, 2)
-    factors, displacements = curve[curve[:, 1] <= limit].T.tolist()
+        # (at a factor that failed the body may have flowed when it was tried again)
+        failure = None if search.bad in curve else failures[search.bad]
+        reason = "flow" if failure is None else "no convergence"
+    rows = np.array([(factor, *curve[factor]) for factor in sorted(curve)])
+    factors, displacements = rows[rows[:, 2] <= FLOW, :2].T.tolist()
     return StrengthReduction(
-        search.good,
-        float(search.bad),
-        factors,
-        displacements,
-        limit,
-        reason,
-        failure,
-        curve,
+        search.good, float(search.bad), factors, displacements, reason, failure, rows
     )
 
 
-def _warn_if_far(problem: QuasiStaticProblem, result: StrengthReduction) -> None:
-    """Warn where Newton's method failed for a body that has hardly moved (collective)."""
-    limit = result.limit if result.limit < np.inf else _elastic_displacement(problem)
-    if result.displacements[-1] < 0.25 * limit:  # it does not look as if it slid
+def _warn_if_at_rest(problem: QuasiStaticProblem, result: StrengthReduction, rate: float) -> None:
+    """Warn where Newton's method failed for a body that hardly gives way (collective)."""
+    if rate < 0.5 * FLOW:
         warn(
             problem.bodies[0].mesh.comm,
             f"The factor of safety of {result.factor:g} may be too low: at {result.above:g} "
-            f"Newton's method failed, for a body that has moved by {result.displacements[-1]:.3g} "
-            f"(limit {limit:.3g}). {result.failure!s}",
+            f"Newton's method failed, for a body that does not flow: it strained by {rate:.2g} of "
+            f"the strength that it lost last (it flows at {FLOW:g}). {result.failure!s}",
         )
 
 
@@ -240,7 +243,6 @@ def _require(
     step: float,
     tolerance: float,
     most: float,
-    displacement: float | None,
 ) -> None:
     """Raise an error where :func:`strength_reduction` was given what it cannot do (collective)."""
     if not isinstance(problem, QuasiStaticProblem):
@@ -250,15 +252,13 @@ def _require(
             "strength_reduction() needs an mpm.QuasiStaticProblem, whose steps have no duration, "
             f"not an mpm.{type(problem).__name__}."
         )
-    anywhere = displacement is None or displacement == np.inf
-    numbers = [step, tolerance, most, 1.0 if anywhere else displacement]
     if not all(
         isinstance(n, float | int | np.floating | np.integer)
         and not isinstance(n, bool)
         and 0.0 < n < np.inf
-        for n in numbers
+        for n in (step, tolerance, most)
     ):
-        raise MPMError("step, tolerance, most and displacement must be positive numbers.")
+        raise MPMError("step, tolerance and most must be positive numbers.")
     if min(step, tolerance) < NEGLIGIBLE:
         raise MPMError(f"step and tolerance must be at least {NEGLIGIBLE:g}.")
     if most <= 1.0:
@@ -288,39 +288,43 @@ def _moved(problem: QuasiStaticProblem, start: list[Array]) -> float:
     return float(max(comm.allgather(max(size.max(initial=0.0) for size in sizes))))
 
 
-def _elastic_displacement(problem: QuasiStaticProblem) -> float:
-    """Return half the strain of the stress at the modulus of shear, times extent (collective)."""
-    comm = problem.bodies[0].V.mesh.comm
-    sums, corners = np.zeros(2), []
-    for body, points in zip(problem.bodies, problem.points, strict=True):
-        shear = undeformed_tangent(points.laws)[:, 0, 1, 0, 1].reshape(body.num_local, -1)
-        strains = np.linalg.norm(body.stress.reshape(-1, 9), axis=1) / shear.mean(axis=1)
-        sums += body.initial_volume @ strains**2, body.initial_volume.sum()
-        corners.append(body.mesh.geometry.x[:, : body.V.mesh.geometry.dim])
-    x = np.concatenate(corners)
-    lower = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
-    upper = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
-    extent = float(np.prod(upper - lower) ** (1.0 / len(lower)))
-    squares, volume = np.sum(comm.allgather(sums), axis=0)
-    way = 0.5 * extent * float(np.sqrt(squares / volume))
-    return way if way > 0.0 else np.inf
+def _strained(problem: QuasiStaticProblem, before: list[Array]) -> float:
+    """Return by how much what moves has strained since there were gradients (collective).
+
+    Args:
+        problem: It.
+        before: Deformation gradients of its bodies then.
+    """
+    sums = np.zeros(2)
+    for body, then in zip(problem.bodies, before, strict=True):
+        change = (body.deformation_gradient - then) @ np.linalg.inv(then)
+        strain = np.linalg.norm(change + change.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(6.0)
+        sums += body.initial_volume @ strain**2, body.initial_volume @ strain
+    whole, mean = np.sum(problem.bodies[0].V.mesh.comm.allgather(sums), axis=0)
+    return float(whole / mean) if mean > 0.0 else 0.0
 
 
-def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) -> float | MPMError:
-    """Look for equilibrium with the present strength, and stay there if it is within a limit.
+def _equilibrium(problem: QuasiStaticProblem, start: list[Array], most: float) -> _Found | MPMError:
+    """Look for equilibrium with the present strength, and stay there unless the body flows.
 
     Whatever else ends it, Ctrl-C or an error in a user's function, leaves the body where it was.
 
+    Args:
+        problem: It.
+        start: Displacements of the bodies' nodes when the reduction began.
+        most: What it may strain by.
+
     Returns:
-        How far the body has moved, or why no equilibrium was found.
+        What was found, or why nothing was.
     """
     comm, stages = problem.bodies[0].V.mesh.comm, len(problem.history.stages)
-    found: float | MPMError
+    found: _Found | MPMError
     with held() as hold:
         before = problem.state.capture()
+        gradients = [body.deformation_gradient for body in problem.bodies]
         try:
             problem.step()
-            found = _moved(problem, start)
+            found = _Found(_moved(problem, start), _strained(problem, gradients))
             if interrupted(comm):
                 settle(comm)
                 raise KeyboardInterrupt
@@ -334,7 +338,7 @@ def _equilibrium(problem: QuasiStaticProblem, start: list[Array], limit: float) 
                 "A stage was begun within strength_reduction(), by a method of the problem's own; "
                 "a factor is of one stage alone."
             )
-        if not isinstance(found, MPMError) and found > limit:
+        if not isinstance(found, MPMError) and found.strain > most:
             problem.state.adopt(before)
     if interrupted(comm, hold.left):
         raise KeyboardInterrupt

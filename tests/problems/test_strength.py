@@ -73,26 +73,28 @@ def test_slope_of_griffiths_and_lane():
     assert found.factors == sorted(found.factors) and found.factors[-1] == found.factor
     assert found.displacements == sorted(found.displacements)
     assert problem.history.steps[-1].load == 1.0 and problem.points[0] is law
-    assert found.displacements[-1] > 5 * found.displacements[1]
+    assert found.displacements[-1] > 3 * found.displacements[1]
     problem.step()  # with the strength that was given: nothing moves on
 
 
-@pytest.mark.parametrize("step", [0.1, *slow(0.02, 0.05, 0.2)])
-@pytest.mark.parametrize("given", [None, *slow(0.04)])
-def test_slope_as_it_stands(step, given):
-    """What Newton's method misses in a long step is tried again in shorter ones, up to the limit.
+@pytest.mark.parametrize("step", [0.05, *slow(0.02, 0.1, 0.2)])
+def test_slope_as_it_stands(step):
+    """Steps change the factor by less than a hundredth.
 
-    In steps of 0.1 it fails at 1.35, which the slope bears.
+    Long ones fail where the slope stands, and are tried again in shorter ones. Strains go from
+    thousandths of the lost strength to its half within a hundredth of the factor.
     """
     problem = slope()
     problem.solve(2)
-    elastic = 20.0 * H**2 / 1e5
-    found = mpm.strength_reduction(problem, step=step, displacement=given)
-    assert found.factor == pytest.approx(1.41, abs=0.006)  # 1.40 by Griffiths & Lane
-    assert 0 < found.above - found.factor <= 0.01
-    assert found.limit == (given or pytest.approx(1.36 * elastic, rel=0.1))
-    assert found.displacements[-1] <= found.limit < 4 * found.displacements[-1]
+    found = mpm.strength_reduction(problem, step=step)
+    assert found.factor == pytest.approx(1.400, abs=0.006)  # 1.40 by Griffiths & Lane
+    assert 0 < found.above - found.factor <= 0.01 and found.reason == "flow"
     assert found.factors[:2] == [1.0, round(1.0 + step, 2)]
+    factors, displacements, rates = found.curve.T
+    stands = rates <= 0.1
+    np.testing.assert_array_equal(found.factors, factors[stands])
+    np.testing.assert_array_equal(found.displacements, displacements[stands])
+    assert rates[0] == 0.0 and rates[1] < 0.01 < 0.1 < rates[~stands].min()
 
 
 @pytest.mark.slow
@@ -207,16 +209,19 @@ def test_what_is_weak_stays_weak(change, mpi_tmp_path):
         block(materials.Tresca(1e3, 0.3, cohesion=6.0 / 2.2)).restore(mpi_tmp_path / "weak")
 
 
-def test_stops_where_the_body_moves_too_far():
-    """A block that stands on its base yields, and stays in the state before it went too far."""
+def test_stops_where_the_body_flows():
+    """A block that stands on its base is left in the state before it flows.
+
+    Uniform stress bears its weight at the base, 4 of height 2, where 12 are its strength.
+    """
     problem = block()
     with pytest.raises(mpm.MPMError, match="whole load"):
         mpm.strength_reduction(problem)
     problem.solve(2)
     start = in_order(problem.particles, problem.particles.centroid)
-    found = mpm.strength_reduction(problem, displacement=0.2)
+    found = mpm.strength_reduction(problem)
     moved = in_order(problem.particles, problem.particles.centroid) - start
-    assert 0 < np.linalg.norm(moved, axis=1).max() <= 0.2 and found.displacements[-1] <= 0.2
+    assert 0 < np.linalg.norm(moved, axis=1).max() <= found.displacements[-1] < 0.05
     assert 1.5 < found.factor < 4.0
     assert found.above - found.factor <= 0.01
     yields = problem.points[0].last.yield_function().max()
@@ -272,8 +277,7 @@ def test_what_fails_from_afar_is_tried_again_from_nearer(step):
     assert 1.41 <= found.factor <= 1.42 < found.above <= found.factor + 0.01
 
 
-@pytest.mark.parametrize("limit", [None, np.inf])
-def test_failures_far_from_a_slide_are_told(limit):
+def test_failures_far_from_a_slide_are_told():
     problem = block(kind=Watched)
     problem.solve(2)
 
@@ -284,12 +288,12 @@ def test_failures_far_from_a_slide_are_told(limit):
     problem.before = newton
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        found = mpm.strength_reduction(problem, displacement=limit)
+        found = mpm.strength_reduction(problem)
     if WORLD.rank == 0:
-        told = "may be too low: at 1.2125 Newton's method failed"
+        told = "may be too low: at 1.2125 Newton's method failed, for a body that does not flow"
         assert told in str(caught[-1].message) and "It does not converge" in str(caught[-1].message)
     assert found.reason == "no convergence" and found.failure.particles == [3]
-    np.testing.assert_array_equal(found.curve, np.transpose([found.factors, found.displacements]))
+    np.testing.assert_array_equal(found.curve[:, :2].T, [found.factors, found.displacements])
 
 
 def test_states_that_cannot_repeat_their_step_are_refused():
@@ -304,26 +308,27 @@ def test_states_that_cannot_repeat_their_step_are_refused():
         mpm.strength_reduction(problem)
     assert caught.value.particles == [3] and problem.points[0].laws.weakening == 1.0
     problem.before = lambda factor: None
-    with pytest.raises(mpm.MPMError, match="beyond the limit 1e-30"):
-        problem.particles.load.value = 1.01
-        mpm.strength_reduction(problem, displacement=1e-30)
+    with pytest.raises(mpm.MPMError, match=r"above 0\.005: it flows"):
+        problem.particles.load.value = 3.0
+        mpm.strength_reduction(problem)
 
 
-def test_what_moves_too_far_is_not_tried_again():
+def test_a_factor_at_which_the_body_flows_is_not_tried_again():
     problem = block(kind=Watched)
     problem.solve(2)
-    found = mpm.strength_reduction(problem, step=0.5, displacement=0.2)
+    found = mpm.strength_reduction(problem, step=0.5)
     fell = [f for f in problem.tried if f not in found.factors]
     assert fell == sorted(set(fell), reverse=True) and found.above == fell[-1]
-    assert found.reason == "displacement" and found.failure is None
+    assert found.reason == "flow" and found.failure is None
     last = len(found.factors)
-    np.testing.assert_array_equal(found.curve[:last].T, [found.factors, found.displacements])
-    assert found.curve[last, 0] == found.above and found.curve[last, 1] > 0.2
-    assert found.displacements[-1] <= 0.2 and len(fell) >= 3
+    np.testing.assert_array_equal(found.curve[:last, :2].T, [found.factors, found.displacements])
+    assert found.curve[last, 0] == found.above and np.all(found.curve[last:, 2] > 0.1)
+    assert found.curve[:last, 2].max() <= 0.1 and len(fell) >= 3
     other = block()
     other.solve(2)
-    again = mpm.strength_reduction(other, displacement=0.2)
-    assert again.factor == pytest.approx(found.factor, abs=0.02)
+    again = mpm.strength_reduction(other)
+    # (so soft a body strains by 0.05 of the loss before it flows, and by 0.15 after that)
+    assert again.factor == pytest.approx(found.factor, rel=0.02)
 
 
 def ctrl_c():
@@ -337,8 +342,7 @@ def fault():
 
 
 @pytest.mark.parametrize("ends", [ctrl_c, fault])
-@pytest.mark.parametrize("limit", [np.inf, 0.2])
-def test_interrupted_reduction_leaves_the_last_state_that_counts(ends, limit):
+def test_interrupted_reduction_leaves_the_last_state_that_counts(ends):
     problem = block(kind=Watched)
     problem.solve(2)
     law, here = problem.points[0], {}
@@ -352,8 +356,8 @@ def test_interrupted_reduction_leaves_the_last_state_that_counts(ends, limit):
 
     problem.after = after
     with pytest.raises(KeyboardInterrupt if ends is ctrl_c else ZeroDivisionError):
-        mpm.strength_reduction(problem, displacement=limit)
-    assert problem.tried == [1.0, 1.1, 1.2, 1.3] and problem.points[0].laws.weakening == 1.0
+        mpm.strength_reduction(problem)
+    assert problem.tried == [1.0, 1.05, 1.1, 1.15] and problem.points[0].laws.weakening == 1.0
     np.testing.assert_array_equal(problem.particles.converged_displacement, here["d"])
     assert problem.points[0] is law and len(problem.history.steps) == here["steps"]
     problem.step()  # and with the strength that was given it stands there
@@ -366,8 +370,8 @@ def test_domains_that_may_be_split_are_refused():
     with pytest.raises(mpm.MPMError, match="which a split of domains changes"):
         mpm.strength_reduction(problem)
     problem.particles.on_distortion = "error"
-    found = mpm.strength_reduction(problem, tolerance=0.1, most=1.2, displacement=np.inf)
-    assert found.factor == 1.2 and found.above == found.limit == np.inf
+    found = mpm.strength_reduction(problem, tolerance=0.1, most=1.2)
+    assert found.factor == 1.2 and found.above == np.inf
     assert found.reason == "most"
 
 

@@ -618,13 +618,13 @@ def factor_of_a_cut(nailed):
         rows = [line((3.0, y), (6.0, y - 0.4), 12) for y in (1.5, 2.5)]
         problem.stage("nail", terms=[mpm.Truss(soil, points, 4e4, bond=bond) for points in rows])
     problem.solve(3)
-    return mpm.strength_reduction(problem, tolerance=0.05)
+    return mpm.strength_reduction(problem, tolerance=0.02)
 
 
 @pytest.mark.slow
 def test_nails_hold_a_cut():
     bare, nailed = factor_of_a_cut(False), factor_of_a_cut(True)
-    assert bare.reason == nailed.reason == "displacement"
+    assert bare.reason == nailed.reason == "flow"
     assert 1.3 < bare.factor < 1.45 and nailed.factor > 1.75
 
 
