@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <optional>
+#include <stdexcept>
 #include <string>
 #include <tuple>
 #include <type_traits>
@@ -511,6 +512,11 @@ Form form_of(const Compiled& compiled)
 
 NB_MODULE(_loops, m)
 {
+#ifdef __AVX2__
+  if (!__builtin_cpu_supports("avx2"))
+    throw std::runtime_error("mpm_dolfinx was compiled for processors with AVX2, which this one does "
+                             "not have: install it again on this machine, or a wheel.");
+#endif
   m.attr("sources") = LOOPS_SOURCES;
   m.doc() = "Compiled loops over particle domains.";
 
