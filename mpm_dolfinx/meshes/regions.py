@@ -167,7 +167,7 @@ def facet_tags(domain: mesh.Mesh, where: Mapping[int, Where], interior: bool = F
         The tags, for ``facet_tags=``.
 
     Raises:
-        MPMError: No tags, or one that no facet has.
+        MPMError: No tags, or one that no facet has, or that a later one takes all of.
     """
     dim = domain.topology.dim - 1
     domain.topology.create_connectivity(dim, dim + 1)
@@ -187,7 +187,7 @@ def cell_tags(domain: mesh.Mesh, where: Mapping[int, Where]) -> Any:
         The tags, for ``cell_tags=``.
 
     Raises:
-        MPMError: No tags, or one that no cell has.
+        MPMError: No tags, or one that no cell has, or that a later one takes all of.
     """
     dim = domain.topology.dim
     index = domain.topology.index_map(dim)
@@ -226,6 +226,12 @@ def _tags(
         if not comm.allreduce(len(chosen)):
             raise MPMError(f"No {noun} of the mesh is where tag {tag} is asked for.")
         values.update(dict.fromkeys(chosen.tolist(), int(tag)))
+    for tag in where:
+        if not comm.allreduce(int(tag) in values.values()):
+            raise MPMError(
+                f"Nothing is left of tag {tag}: later tags are asked for where it is, and each "
+                f"{noun} has one; let the smaller part come last."
+            )
     places = np.array(sorted(values), dtype=np.int32)
     tags = np.array([values[place] for place in places.tolist()], dtype=np.int32)
     return mesh.meshtags(domain, dim, places, tags)
@@ -277,7 +283,9 @@ def held(
         )
     if not comm.allreduce(len(facets), MPI.SUM):
         raise MPMError(
-            f"No facet of the background lies where it is to be held{_of_planes(planes, domain)}."
+            "No facet of the background has all its vertices where it is to be held"
+            f"{_of_planes(planes, domain)}; hold a point by a range with a facet in it, such as "
+            "x=(-0.1, 0.1)."
         )
     space = V if component is None else V.sub(component)
     return _condition(V, space, component, facets, dim, value)

@@ -115,6 +115,7 @@ def test_what_is_not_there_is_refused(domain):
     V = scenes.vectors(domain)
     nowhere = mpm.region(x=0.3)
     raises(lambda: mpm.held(V, 0, x=0.3), mpm.MPMError, r"x = 0\.3, the nearest vertex at 0\.5")
+    raises(lambda: mpm.held(V, 0, x=0.0, y=0.0), mpm.MPMError, r"hold a point by a range")
     raises(lambda: mpm.held(V, 2, x=0.0), mpm.MPMError, "no component 2")
     raises(lambda: mpm.held(V), mpm.MPMError, "needs x=, y=, z=")
     raises(lambda: mpm.held(V, r=0.0), mpm.MPMError, "no r=")
@@ -123,6 +124,8 @@ def test_what_is_not_there_is_refused(domain):
     raises(lambda: mpm.held(V, x=0.0, value=(1.0, 2.0, 3.0)), mpm.MPMError, "must have .2,")
     raises(lambda: mpm.held(V, where=lambda x: 1 / 0), mpm.MPMError, "ZeroDivisionError")
     raises(lambda: mpm.facet_tags(domain, {1: nowhere}), mpm.MPMError, "where tag 1")
+    hidden = {1: mpm.region(y=3.0, x=(0.0, 1.0)), 2: mpm.region(y=3.0)}
+    raises(lambda: mpm.facet_tags(domain, hidden), mpm.MPMError, "Nothing is left of tag 1")
     raises(lambda: mpm.facet_tags(domain, {}), mpm.MPMError, "needs {tag: where")
     raises(lambda: mpm.facet_tags(domain, {1.5: nowhere}), mpm.MPMError, "whole number")
     raises(lambda: mpm.cell_tags(domain, {1: 2.0}), mpm.MPMError, "function of coordinates")
