@@ -73,7 +73,7 @@ def count_levels(counts: dict[str, int], pc: PETSc.PC) -> None:
     the rank, and how much that uses it: by these the dofs are given to ranks.
     """
     levels = range(1, pc.getMGLevels())
-    operators = [pc.getMGSmoother(level).getOperators()[0] for level in levels]
+    operators = [pc.getMGSmoother(level).getOperators()[1] for level in levels]
     interpolations = [pc.getMGInterpolation(level) for level in levels]
     coarsest = pc.getMGCoarseSolve().getOperators()[0]
     counts["product"] = received(operators[-1])
