@@ -64,10 +64,30 @@ core::galerkin_pattern(const SparseRows& A, const SparseRows& P, std::size_t cou
     for (std::int32_t e = P.offsets[row]; e < P.offsets[row + 1]; ++e)
       rows[place[P.columns[e]]++] = static_cast<std::int32_t>(row);
 
+  const std::vector<std::int32_t> first = equal_rows(A);
+  std::vector<std::int32_t> group(P.count); // of equal rows
+  for (std::size_t g = 0; g + 1 < first.size(); ++g)
+    std::fill(group.begin() + first[g], group.begin() + first[g + 1], static_cast<std::int32_t>(g));
+  const auto is_like_last = [&](std::size_t a) {
+    return a > 0
+           && std::equal(rows.begin() + ends[a - 1], rows.begin() + ends[a], rows.begin() + ends[a],
+                         rows.begin() + ends[a + 1], [&](std::int32_t one, std::int32_t other) {
+      return group[one] == group[other];
+    });
+  };
+
   std::vector<std::int32_t> offsets(1, 0), columns;
   std::vector<std::int32_t> fine(P.count, -1), coarse(count, -1); // who has seen a column last
   for (std::int32_t a = 0; a < static_cast<std::int32_t>(count); ++a)
   {
+    if (is_like_last(a)) // as the numbers of one node are
+    {
+      const auto end = static_cast<std::int32_t>(columns.size());
+      for (std::int32_t k = offsets[a - 1]; k < end; ++k)
+        columns.push_back(columns[k]);
+      offsets.push_back(static_cast<std::int32_t>(columns.size()));
+      continue;
+    }
     for (std::int32_t n = ends[a]; n < ends[a + 1]; ++n)
       for (std::int32_t k = A.offsets[rows[n]]; k < A.offsets[rows[n] + 1]; ++k)
       {
