@@ -116,20 +116,56 @@ class Grip:
         mine = total[self.nodes]
         return np.asarray(mine / np.linalg.norm(mine, axis=1)[:, None])
 
-    def skin(self, before: NDArray[np.float64], slip: NDArray[np.float64]) -> Skin:
+    def skin(
+        self,
+        before: NDArray[np.float64],
+        slip: NDArray[np.float64],
+        resists: NDArray[np.bool_],
+    ) -> Skin:
         """Return the forces of the bond per length after slips of a step.
+
+        Where a piece of the bar slips as a whole, between what is slack or yields, the bond alone
+        holds it. Beyond the limit it has a secant there, at the node that slips least: with no
+        more than the tangent of the other nodes a slip would be without bound.
 
         Args:
             before: Its forces per length at the last converged step, shape ``(b,)``.
             slip: Shape ``(b,)``.
+            resists: Which cells of the bar resist a slip of their nodes, shape ``(m,)``.
         """
         bond = self._bond
         trial = before + bond.stiffness * slip
         bears = np.clip(trial, -bond.limit, bond.limit)
         slips = bears != trial
         # (where a whole bar slips, no change of force, but a tangent that can be solved with)
-        tangent = self._sizes * np.where(slips, SMALL, 1.0) * bond.stiffness
+        secant = bears / np.where(slips, trial, 1.0)
+        loose = self._loose(slips, secant, resists)
+        share = np.where(slips, SMALL, 1.0)
+        share[loose] = secant[loose]
+        tangent = self._sizes * share * bond.stiffness
         return Skin(bears, self._sizes * bears, tangent, slips)
+
+    def _loose(
+        self, slips: NDArray[np.bool_], secant: NDArray[np.float64], resists: NDArray[np.bool_]
+    ) -> NDArray[np.int64]:
+        """Return the node that slips least on each piece of the bar of which no node sticks."""
+        piece, cells = np.arange(self._cells.max() + 1), self._cells[resists]
+        stays = np.ones(len(piece), dtype=bool)
+        stays[self.nodes] = ~slips
+        if stays.all():
+            return np.zeros(0, dtype=np.int64)
+        while True:
+            lowest = piece.copy()
+            np.minimum.at(lowest, cells, piece[cells].min(axis=1, initial=len(piece))[:, None])
+            if np.array_equal(lowest, piece):
+                break
+            piece = lowest
+        held = np.zeros(len(piece), dtype=bool)
+        held[piece[stays]] = True
+        loose = np.flatnonzero(~held[piece[self.nodes]])
+        loose = loose[np.argsort(-secant[loose], kind="stable")]
+        _, first = np.unique(piece[self.nodes[loose]], return_index=True)
+        return np.asarray(loose[first])
 
 
 def _shares(layout: Layout) -> NDArray[np.float64]:

@@ -286,13 +286,13 @@ class Structure(Term):
 
     @override
     def begin(self) -> Sequence[PETSc.Vec]:
+        """Begin a step; the last evaluation stays until the next, and may still be committed."""
         require_same(self.comm, offset=self._path)
         there = self._hosts.present()[self.layout.cells].all(axis=1)
         along = self._step.along
         if self._grip is not None:
             along = self._grip.directions(self.places())
         self._step = _Step(there.astype(np.float64), along)
-        self.roll_back()
         return ()
 
     def _evaluated(self) -> _Now:
@@ -303,9 +303,11 @@ class Structure(Term):
         slip[self._alone] = self._path
         if self._grip is not None:
             slip[self._grip.nodes] += self._slipped[:, None] * self._step.along
-            skin = self._grip.skin(self.state.bond[self._grip.nodes], self._slipped)
         places = self.layout.nodes + self._hosts.displacement() + slip
         nodal = stretched(self._rule, self.law, places, self.state.offset, self._step.present)
+        if self._grip is not None:
+            before = self.state.bond[self._grip.nodes]
+            skin = self._grip.skin(before, self._slipped, ~nodal.special.all(axis=1))
         forces = np.zeros_like(self.layout.nodes)
         np.add.at(forces, self.layout.cells, nodal.forces)
         self._now = _Now(nodal, forces, skin, slip)

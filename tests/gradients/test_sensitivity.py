@@ -356,7 +356,9 @@ def test_free_nodes_are_not_followed(who, free):
     body = scenes.unit(2, scenes.QUADRILATERAL)
     V = scenes.vectors(scenes.box([-0.5, -0.5], [1.5, 1.5], [4, 4], scenes.QUADRILATERAL))
     problem = mpm.QuasiStaticProblem(
-        mpm.Body(mpm.Particles(body, V, free=free, quadrature_degree=2), materials.Hencky(1e3, 0.3)),
+        mpm.Body(
+            mpm.Particles(body, V, free=free, quadrature_degree=2), materials.Hencky(1e3, 0.3)
+        ),
         bcs=[mpm.held(V, y=0.0)],
     )
     with pytest.raises(mpm.MPMError, match="does not follow bodies with free nodes"):

@@ -832,3 +832,27 @@ def test_nodes_and_cells_of_a_mesh_have_its_own_order_on_any_number_of_ranks():
     drawn = layout_of(lines, WORLD, 2, "Truss", False)
     np.testing.assert_array_equal(drawn.nodes, points)
     np.testing.assert_array_equal(np.sort(drawn.cells, axis=1), ends)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "limits", "limit"),
+    [("midpoint", {}, 0.05), ("euler", {"compression": False}, 0.2)],
+)
+def test_in_motion_a_bar_is_in_balance_with_what_holds_it(scheme, limits, limit):
+    """It has no mass; and pieces of it slip as a whole, beside what is slack."""
+    block = mpm.Particles(box([0, 0], [1, 1], [4, 4], QUADRILATERAL))
+    ends = np.array([[0.1, 0.15], [0.8, 0.85]])
+    bond = mpm.Bond(1e3, limit)
+    nail = mpm.Truss(block, np.linspace(*ends, 7), 300.0, bond=bond, **limits)
+    own = mpm.Body(block, Hencky(1e3, 0.3), density=1.0, body_force=(3.0, -10.0))
+    held = [mpm.held(block.W, y=0.0)]
+    problem = mpm.DynamicProblem(own, bcs=held, terms=[nail], scheme=scheme)
+    most = 0.0
+    for _ in problem.steps(time=0.16, dt=0.02):
+        length = np.linalg.norm(ends[1] - ends[0]) / 6
+        inside = np.cumsum(nail.state.bond)[:-1] - 0.5 * nail.state.bond[0]
+        np.testing.assert_allclose(nail.force, length * inside, atol=1e-6)
+        most = max(most, np.abs(nail.state.bond).max())
+    assert most == pytest.approx(limit) and np.abs(nail.state.slip).max() > 1e-4
+    assert problem.history.cutbacks == 0
+    assert max(step.iterations for step in problem.history.steps) < 10
