@@ -40,7 +40,7 @@ demo: ## Install what is needed, run the first demo, make its picture
 	cd output && "$(abspath $(BIN)/python)" ../demos/demo_column_roller.py
 	@echo "The picture is output/column_roller.png"
 
-test: ## A quarter of an hour: the quick tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
+test: ## Ten minutes: the quick tests on 1, then on NP="2 3" ranks (ARGS=tests/materials: seconds)
 	@$(SETUP) wheel plot test adjoint
 	@bash scripts/run_tests.sh $(ARGS)
 

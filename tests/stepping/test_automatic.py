@@ -236,6 +236,7 @@ def pressed(law=None):
     return problem, lambda t: disc.move((0.0, -0.1 * t)), disc
 
 
+@pytest.mark.slow
 def test_errors_of_contact_from_the_first_step_on_fall_with_the_tolerance():
     ends = []
     for count in (25, 50):

@@ -138,8 +138,8 @@ def thrown(kind, **options):
 @pytest.mark.parametrize(
     ("kind", "scheme"),
     [
-        ("rigid", "midpoint"),
-        ("plastic", "euler"),
+        pytest.param("rigid", "midpoint", marks=pytest.mark.slow),
+        pytest.param("plastic", "euler", marks=pytest.mark.slow),
         pytest.param("plastic", "conserving", marks=pytest.mark.slow),
         pytest.param("pair", "conserving", marks=pytest.mark.slow),
         ("background", "euler"),
