@@ -87,6 +87,7 @@ class ShiftedFactor:
         self.iterates = False
         self._own_rtol = self._own_type = False
         self._longest = ITERATIONS
+        self._bearable = np.inf  # iterations for a decade of the residual
         self._dear = False  # what multigrid takes, beside a factorisation
         self._left: float | None = None  # of the residual, by the linear model
         self._bent, self._curved = 1.0, 1.0  # what that lacked in the first solve of a step
@@ -177,6 +178,7 @@ class ShiftedFactor:
         """
         self.D = self._left = None
         self._constrained = levels.constrained
+        self._bearable = self._iterations_for_a_factor(size)
         iterates = self._prefers_multigrid(size, levels)
         if iterates != self.iterates:
             self._choose(iterates)
@@ -231,7 +233,7 @@ class ShiftedFactor:
         kind = levels.coarsening
         return size >= least[kind if self._symmetric else max(kind, Coarsening.FAIR)]
 
-    def _bearable(self, size: int) -> float:
+    def _iterations_for_a_factor(self, size: int) -> float:
         """Return the iterations for a decade of the residual that cost as much as a factor."""
         bearable = self._strategy.bearable
         if self._linear_solver != "auto" or bearable is None:
@@ -396,7 +398,7 @@ class ShiftedFactor:
         That is the finer of Eisenstat & Walker's (1996) two choices: by how much the linear model
         has missed the residual, and what the last iteration has made of that, to the power of the
         golden ratio; no more than its tolerance asks for. A step begins with what the model
-        lacked at the beginning of the last one.
+        lacked at the beginning of the last one. Multigrid may take as long as a factor would.
 
         Args:
             norms: Norms of the residuals so far.
@@ -416,7 +418,8 @@ class ShiftedFactor:
         if norms and norms[-1] > 0.0:
             rtol = max(rtol, min(FINAL * tolerance / norms[-1], INEXACT))
         rtol = max(rtol, SOLVED)
-        self._ksp.setTolerances(rtol=rtol, max_it=self._longest)
+        bearable = self._bearable * max(-math.log10(rtol), 1.0)
+        self._ksp.setTolerances(rtol=rtol, max_it=math.ceil(min(bearable, self._longest)))
 
     def end(self) -> None:
         """End a step that has converged."""
@@ -494,7 +497,7 @@ class ShiftedFactor:
         self._left = left
         if 0.0 < left < size:
             decades = max(math.log10(size / left), 1.0)
-            self._dear = ksp.getIterationNumber() > decades * self._bearable(b.getSize())
+            self._dear = ksp.getIterationNumber() > decades * self._bearable
 
     def _does(self, b: PETSc.Vec) -> bool:
         """Return whether a solve that round-off has ended leaves a residual that does for Newton.
