@@ -239,6 +239,7 @@ SAND = mpm.materials.MohrCoulomb(1e6, 0.3, 2e4, 30.0, 5.0)
 GMSH = {"background": partial(unstructured, 8.0, 0.4), "body": TETRAHEDRON}
 GMSH_FINE = {"background": partial(unstructured, 8.0, 0.28), "body": TETRAHEDRON}
 GMSH_2 = {"background": partial(unstructured, 8.0, 0.8), "body": TETRAHEDRON, "degree": 2}
+GMSH_2_FINE = {**GMSH_2, "background": partial(unstructured, 8.0, 0.58)}
 SCENES = [
     Scene("hexahedra", heavy, 9),
     Scene("ghost penalty", partial(heavy, stabilisation="ghost"), 9),
@@ -260,12 +261,17 @@ SCENES = [
     Scene("degree 2, Poisson's ratio 0.49", partial(heavy, degree=2, law=NEARLY), 5, 2),
     Scene("degree 2, tetrahedra", partial(heavy, degree=2, **TET), 5, 2),
     Scene("degree 2, gmsh", partial(heavy, **GMSH_2), 5, 2),
+    Scene("degree 2, tetrahedra, finer", partial(heavy, degree=2, **TET), 7, 2),
+    Scene("degree 2, gmsh, finer", partial(heavy, **GMSH_2_FINE), 7, 2),
     Scene("degree 3", partial(heavy, degree=3, law=ELASTIC), 3, 1),
+    Scene("degree 3, finer", partial(heavy, degree=3, law=ELASTIC), 4, 1),
     Scene("rigid sphere", partial(pressed, friction=0.0), 15, 6),
     Scene("rigid sphere, friction 0.3", partial(pressed, friction=0.3), 15, 6),
+    Scene("rigid sphere, friction, finer", partial(pressed, friction=0.3), 19, 6),
     Scene("two bodies", partial(stacked, friction=0.0), 12, 4),
     Scene("two bodies, finer", partial(stacked, friction=0.0), 18, 4),
     Scene("two bodies, friction 0.3", partial(stacked, friction=0.3), 12, 4),
+    Scene("two bodies, friction, finer", partial(stacked, friction=0.3), 18, 4),
     Scene("sand, not associated", partial(heavy, law=SAND, weight=4e3), 9),
     Scene("sand, finer", partial(heavy, law=SAND, weight=4e3), 13),
     Scene("pressure that follows", squeezed, 15, 6),

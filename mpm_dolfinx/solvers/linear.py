@@ -23,7 +23,7 @@ from .products import acting
 from .refinement import KRYLOV, Refinement
 from .refusals import options_refused, require_factor
 from .saddle import SaddleMultigrid
-from .strategies import STRATEGIES, Coarsening, mumps_options
+from .strategies import STRATEGIES, mumps_options
 from .workspace import FACTORS, give_workspace, lacks_workspace
 
 __all__ = ["ShiftedFactor"]
@@ -227,11 +227,10 @@ class ShiftedFactor:
         if self._linear_solver != "auto":
             return self._linear_solver == "multigrid"
         least = self._strategy.crossover
-        if least is None or self._constrained or size < min(least.values()):
+        if least is None or self._constrained or size < least[0]:
             return False
-        # (how well boxes follow the tangent is asked of many unknowns alone: that takes time)
-        kind = levels.coarsening
-        return size >= least[kind if self._symmetric else max(kind, Coarsening.FAIR)]
+        # (whether boxes follow the tangent is asked of many unknowns alone: that takes time)
+        return size >= least[0 if self._symmetric and levels.nested else 1]
 
     def _iterations_for_a_factor(self, size: int) -> float:
         """Return the iterations for a decade of the residual that cost as much as a factor."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..errors import MPMError
 from .saddle import Fields
-from .strategies import Coarsening
 
 __all__ = ["Levels", "ReducedProblem", "Resisting"]
 
@@ -27,8 +26,8 @@ class Levels(Fields, Protocol):
         """Whether there are unknowns besides displacements."""
 
     @property
-    def coarsening(self) -> Coarsening:
-        """How well multigrid's boxes follow the tangent."""
+    def nested(self) -> bool:
+        """Whether multigrid's boxes follow the tangent."""
 
     @property
     def held(self) -> bool:

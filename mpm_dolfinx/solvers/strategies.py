@@ -4,22 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from enum import IntEnum
 from typing import Any, NamedTuple
 
-__all__ = ["LINEAR_SOLVERS", "STRATEGIES", "Coarsening", "Strategy", "mumps_options"]
+__all__ = ["LINEAR_SOLVERS", "STRATEGIES", "Strategy", "mumps_options"]
 
 #: Values of ``linear_solver``.
 LINEAR_SOLVERS = ("auto", "direct", "multigrid")
-
-
-class Coarsening(IntEnum):
-    """How well the boxes of multigrid follow a tangent."""
-
-    GOOD = 0  # backgrounds are grids, of degree 1 or of boxes
-    FAIR = 1  # of degree 1 and no grid; a term couples two backgrounds, or tangents are unsymmetric
-    POOR = 2  # of degree 2, of simplices or no grid; of a higher one, whose rows are long; friction
 
 
 class Strategy(NamedTuple):
@@ -32,7 +22,8 @@ class Strategy(NamedTuple):
             METIS and no worse, in space worse. It ends the process where all unknowns are
             neighbours of each other, as few may be.
         compressed: Least from which MUMPS's factors have blocks of low rank.
-        crossover: Least from which on multigrid takes less time than a factorisation.
+        crossover: Least from which on multigrid takes less time than a factorisation: where boxes
+            follow the tangent and that is symmetric, and where not.
         bearable: Power p and divisor d: with n unknowns ``n^p / d`` iterations for a decade of the
             residual cost as much as a factor, whose operations grow as n^2 in space.
         taken_over: Most up to which a factorisation takes over where multigrid comes to nothing.
@@ -41,7 +32,7 @@ class Strategy(NamedTuple):
     few: int = 0
     ordered: int | None = None
     compressed: int | None = None
-    crossover: Mapping[Coarsening, int] | None = None
+    crossover: tuple[int, int] | None = None
     bearable: tuple[float, float] | None = None
     taken_over: int = 0
 
@@ -55,14 +46,14 @@ STRATEGIES = {
     2: Strategy(
         few=400,
         ordered=10000,
-        crossover=dict.fromkeys(Coarsening, 40000),
+        crossover=(40000, 40000),
         bearable=(0.5, 30.0),
         taken_over=500000,
     ),
     3: Strategy(
         few=150,
         compressed=20000,
-        crossover={Coarsening.GOOD: 3000, Coarsening.FAIR: 8000, Coarsening.POOR: 50000},
+        crossover=(3000, 8000),
         bearable=(1.0, 450.0),
         taken_over=50000,
     ),

@@ -25,7 +25,6 @@ from dolfinx import fem
 from ..background.grids import box_weights, cell_lines, coarser, grid_lines
 from ..meshes.boxes import BOX_CELLS
 from ..solvers.products import keep_rows
-from ..solvers.strategies import Coarsening
 from ..tolerances import NEGLIGIBLE
 from .numbering import FreeDofs
 
@@ -79,13 +78,11 @@ class Boxes:
         self._V = V
 
     @cached_property
-    def coarsening(self) -> Coarsening:
-        """How well they follow the background (collective)."""
+    def nested(self) -> bool:
+        """Whether they follow the background: a grid of degree 1, or of boxes (collective)."""
         degree = self._V.ufl_element().degree
-        if grid_lines(self._V) is None:
-            return Coarsening.FAIR if degree == 1 else Coarsening.POOR
-        nested = degree == 1 or (degree == 2 and self._V.mesh.basix_cell() in BOX_CELLS)
-        return Coarsening.GOOD if nested else Coarsening.POOR
+        boxes = degree == 2 and self._V.mesh.basix_cell() in BOX_CELLS
+        return grid_lines(self._V) is not None and (degree == 1 or boxes)
 
     @cached_property
     def _lines(self) -> list[NDArray[np.float64]]:

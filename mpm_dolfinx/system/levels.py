@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..parallel.totals import over_ranks
 from ..particles.particles import Particles
-from ..solvers.strategies import Coarsening
 from .field import Field
 from .hierarchy import interpolations
 from .terms import Terms
@@ -61,17 +60,14 @@ class Levels:
         )
 
     @property
-    def coarsening(self) -> Coarsening:
-        """How well multigrid's boxes follow the tangent."""
+    def nested(self) -> bool:
+        """Whether multigrid's boxes follow the tangent; where bodies of two fields meet, not."""
         unknowns = self._unknowns
-        found = [one.host.boxes.coarsening for one in unknowns.subspaces]
         joint = len(unknowns.subspaces) < len(unknowns.fields)
         hosts = ({id(unknowns.place(body)[0]) for body in term.bodies} for term in self._terms)
         if joint or any(len(fields) > 1 for fields in hosts):
-            found.append(Coarsening.FAIR)  # each field has boxes of its own
-        if any(term.one_sided and not term.symmetric for term in self._terms):
-            found.append(Coarsening.POOR)  # a tangent of friction may be indefinite
-        return max(found)
+            return False  # each field has boxes of its own
+        return all(one.host.boxes.nested for one in unknowns.subspaces)
 
     def splits(self) -> Sequence[tuple[str, slice]]:
         """Return names of the fields, and where their unknowns are among this rank's.

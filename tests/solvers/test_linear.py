@@ -12,7 +12,7 @@ from scenes import QUADRILATERAL, TRIANGLE, WORLD
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx.materials import Hencky
-from mpm_dolfinx.solvers import linear, strategies
+from mpm_dolfinx.solvers import linear
 from mpm_dolfinx.solvers.strategies import STRATEGIES as TABLE
 
 
@@ -99,7 +99,7 @@ class Alone:
 
     constrained = False
     held = False
-    coarsening = strategies.Coarsening.GOOD
+    nested = True
 
     def diagonal(self, K):
         diagonal = K.getDiagonal()
