@@ -25,9 +25,10 @@ type Array = NDArray[np.float64]
 #: What says that there is no equilibrium, or none was found.
 FAILURES = (*TRIAL_ERRORS, ParticleOutsideError)
 
-#: Strain of what flows over the relative loss of strength. In a body at rest it is a few elastic
-#: strains. A slide goes on until its shape bears the weaker strength, by strains of the order of 1.
-FLOW = 0.1
+#: Displacement over size, of what moves, over the relative loss of strength: that of a body that
+#: flows, and the most of one that does not begin to. At rest it is a few elastic strains. A slide
+#: goes on until its shape bears the weaker strength, by some tenths of its size times that loss.
+FLOW, REST = 0.03, 0.015
 
 
 @dataclass(frozen=True)
@@ -39,14 +40,14 @@ class StrengthReduction:
         above: The least factor for which none was found; infinite where none was tried.
         factors: The factors with equilibrium, in order.
         displacements: Largest displacement of a node since the reduction began, for each.
-        reason: Why there is none for ``above``: ``"flow"``, the body strains by more than a tenth
-            of the strength that it lost; ``"no convergence"``, where Newton's method failed, which
-            says nothing of the ground unless the body was about to flow; ``"most"``, the body bears
-            the largest factor.
+        reason: Why there is none for ``above``: ``"flow"``, the body slides by more than 0.03 of
+            its size times the strength that it lost, and goes on to; ``"no convergence"``, where
+            Newton's method failed, which says nothing of the ground unless the body was about to
+            flow; ``"most"``, the body bears the largest factor.
         failure: What Newton's method failed with at ``above`` and where, if that is the reason.
-        curve: Factors with any state, in order, the displacements there, and the rates of strain:
-            strain since the last equilibrium over the relative loss of strength, zero at factor 1;
-            those of bodies that flow too, shape ``(n, 3)``.
+        curve: Factors with any state, in order, the displacements there, and the rates: by how
+            much of its size what moves has moved since the last equilibrium, over the relative loss
+            of strength, zero at factor 1; those of bodies that flow too, shape ``(n, 3)``.
     """
 
     factor: float
@@ -60,10 +61,16 @@ class StrengthReduction:
 
 @dataclass(frozen=True)
 class _Found:
-    """A state that was found: how far the body has moved, and by how much what moves strained."""
+    """A state that was found: the factor, how far the body has moved, and its rate."""
 
+    factor: float
     way: float
-    strain: float
+    rate: float
+
+    @property
+    def flows(self) -> bool:
+        """Whether the body gives way."""
+        return self.rate > FLOW
 
 
 class _Search:
@@ -83,13 +90,26 @@ class _Search:
 
     def __init__(self, step: float, most: float) -> None:
         self.good, self.bad = 1.0, np.inf
-        self._step, self._most, self._flows = step, most, np.inf
+        self._step, self._first, self._most = step, step, most
+        self._flows, self._left = (
+            np.inf,
+            0.0,
+        )  # the least at which it flows, the last left in a leap
 
-    def next(self) -> float:
-        """Return the factor to try."""
+    def next(self) -> list[float]:
+        """Return the factor to try, and one beyond it, at which a body that flows may rest."""
         middle = 0.5 * (self.good + self.bad)
+        factor = min(self.good + self._step, middle, self._most)
+        beyond = [factor + self._first] if self._flows == np.inf else []
         # sums of steps are told as 1.2, not as 1.2000000000000002
-        return round(min(self.good + self._step, middle, self._most), 12)
+        return [round(each, 12) for each in (factor, *beyond)]
+
+    def leap(self) -> list[float]:
+        """Return a factor to try, once, beyond one at which Newton's method fails."""
+        if self._flows < np.inf or self.good in (self._left, self._most):
+            return []
+        self._left = self.good
+        return [round(min(self.good + self._first, self._most), 12)]
 
     def stood(self, factor: float) -> None:
         """Go on from a factor, also to those at which Newton's method has failed."""
@@ -97,7 +117,8 @@ class _Search:
 
     def fell(self, factor: float, flows: bool) -> None:
         """Go half as far from the last that stood."""
-        self.bad, self._step = factor, 0.5 * (factor - self.good)
+        self.bad = min(factor, self.bad)
+        self._step = 0.5 * (self.bad - self.good)
         if flows:
             self._flows = factor
 
@@ -118,9 +139,10 @@ def strength_reduction(
 
     Geometry is followed, so a body that slides finds other equilibria further down, as its shape
     changes. They do not count. A body at rest that loses a hundredth of its strength gives way by
-    some hundredths of its elastic strains, one that slides by strains of about a hundredth. So the
-    body flows where its strain (``sqrt(2/3)`` of the norm, in the mean over the body with itself as
-    weight, which is that in the slide) grows by more than a tenth of the relative loss of strength.
+    some hundredths of its elastic strains, one that slides by about a hundredth of its size. So the
+    body flows where it moves by more than 0.03 of the relative loss of strength times its size,
+    both of what moves, and does so again in the next increment: what a few cells do that come to
+    rest is no slide.
     The rule has no length, so how much ground is modelled does not matter. Ground so soft that
     elastic strains come to hundredths flows a few per cent earlier than stiff one.
 
@@ -155,30 +177,26 @@ def strength_reduction(
     search = _Search(float(step), float(most))
     curve: dict[float, tuple[float, float]] = {}
     failures: dict[float, MPMError] = {}
-    factor = 1.0
     try:
         for points in problem.points:
-            points.laws.weaken(search.next())  # laws that do not say what it is refuse that
-        while True:
-            for points in problem.points:
-                points.laws.weaken(factor)
-            loss = np.log(factor / search.good)
-            found = _equilibrium(problem, start, FLOW * (loss or step))
-            if factor == 1.0:
-                _require_rest(found, FLOW * step)
-            if isinstance(found, MPMError):
-                failures[factor] = found
-                search.fell(factor, flows=False)
+            points.laws.weaken(search.next()[0])  # laws that do not say what it is refuse that
+        curve[1.0] = _at_rest(_equilibria(problem, start, 1.0, [1.0], step), step), 0.0
+        factors = search.next()
+        while factors:
+            states, error = _equilibria(problem, start, search.good, factors, step)
+            stands = error is None and not states[-1].flows
+            for each in states if stands else states[:1]:
+                curve[each.factor] = each.way, each.rate
+            if stands:
+                search.stood(states[-1].factor)
             else:
-                rate = found.strain / loss if loss else 0.0
-                curve[factor] = found.way, rate
-                if rate <= FLOW:
-                    search.stood(factor)
-                else:
-                    search.fell(factor, flows=True)
+                search.fell(factors[0], flows=bool(states))
+            if error is not None and not states:
+                failures[factors[0]] = error
+            factors = search.next()
             if search.bad - search.good <= tolerance or search.good >= most:
-                break
-            factor = search.next()
+                # where Newton's method fails for a body at rest, it may not a little further
+                factors = search.leap() if curve[search.good][1] < REST else []
     finally:
         for points in problem.points:
             points.laws.weaken(1.0)
@@ -188,20 +206,23 @@ def strength_reduction(
     return result
 
 
-def _require_rest(found: _Found | MPMError, most: float) -> None:
-    """Raise an error where a step at the present strength is not one of a body at rest."""
-    if isinstance(found, MPMError):
+def _at_rest(found: tuple[list[_Found], MPMError | None], loss: float) -> float:
+    """Return how far a body moves in a step at the present strength, if it is at rest."""
+    states, error = found
+    if error is not None:
         raise MPMError(
             "strength_reduction() begins with a step at the present loads and strength, which "
-            f"failed, so that a factor would mean nothing: {found!s}",
-            found.particles,
-        ) from found
-    if found.strain > most:
+            f"failed, so that a factor would mean nothing: {error!s}",
+            error.particles,
+        ) from error
+    if states[0].flows:
         raise MPMError(
             "strength_reduction() begins with a step at the present loads and strength, in which "
-            f"the body moves by {found.way:.3g} and strains by {found.strain:.3g}, above {most:g}: "
-            "it flows; let it come to rest by problem.step(), or weaken it less."
+            f"the body moves by {states[0].way:.3g}, by {states[0].rate * loss:.3g} of the size of "
+            f"what moves, above {FLOW * loss:g}: it flows; let it come to rest by problem.step(), "
+            "or weaken it less."
         )
+    return states[0].way
 
 
 def _result(
@@ -221,7 +242,7 @@ def _result(
         failure = None if search.bad in curve else failures[search.bad]
         reason = "flow" if failure is None else "no convergence"
     rows = np.array([(factor, *curve[factor]) for factor in sorted(curve)])
-    factors, displacements = rows[rows[:, 2] <= FLOW, :2].T.tolist()
+    factors, displacements = rows[rows[:, 0] <= search.good, :2].T.tolist()
     return StrengthReduction(
         search.good, float(search.bad), factors, displacements, reason, failure, rows
     )
@@ -229,12 +250,12 @@ def _result(
 
 def _warn_if_at_rest(problem: QuasiStaticProblem, result: StrengthReduction, rate: float) -> None:
     """Warn where Newton's method failed for a body that hardly gives way (collective)."""
-    if rate < 0.5 * FLOW:
+    if rate < REST:
         warn(
             problem.bodies[0].mesh.comm,
             f"The factor of safety of {result.factor:g} may be too low: at {result.above:g} "
-            f"Newton's method failed, for a body that does not flow: it strained by {rate:.2g} of "
-            f"the strength that it lost last (it flows at {FLOW:g}). {result.failure!s}",
+            f"Newton's method failed, for a body that does not flow: it moved by {rate:.2g} of its "
+            f"size times the strength that it lost last (it flows at {FLOW:g}). {result.failure!s}",
         )
 
 
@@ -288,48 +309,66 @@ def _moved(problem: QuasiStaticProblem, start: list[Array]) -> float:
     return float(max(comm.allgather(max(size.max(initial=0.0) for size in sizes))))
 
 
-def _strained(problem: QuasiStaticProblem, before: list[Array]) -> float:
-    """Return by how much what moves has strained since there were gradients (collective).
+def _slid(problem: QuasiStaticProblem, before: list[Array]) -> float:
+    """Return how far what moves has moved since domains were somewhere, over its size (collective).
+
+    The mean is over the body with displacements as weight, ``sum(V u^2) / sum(V u)``, and the size
+    of what moves the root of its volume, ``sum(V u)^2 / sum(V u^2)``.
 
     Args:
         problem: It.
-        before: Deformation gradients of its bodies then.
+        before: Centroids of its bodies then.
     """
     sums = np.zeros(2)
     for body, then in zip(problem.bodies, before, strict=True):
-        change = (body.deformation_gradient - then) @ np.linalg.inv(then)
-        strain = np.linalg.norm(change + change.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(6.0)
-        sums += body.initial_volume @ strain**2, body.initial_volume @ strain
-    whole, mean = np.sum(problem.bodies[0].V.mesh.comm.allgather(sums), axis=0)
-    return float(whole / mean) if mean > 0.0 else 0.0
+        way = np.linalg.norm(body.centroid - then, axis=1)
+        sums += body.initial_volume @ way, body.initial_volume @ way**2
+    mesh = problem.bodies[0].V.mesh
+    first, second = np.sum(mesh.comm.allgather(sums), axis=0)
+    if second == 0.0:
+        return 0.0
+    size = (first / np.sqrt(second)) ** (2.0 / mesh.geometry.dim)
+    return float(second / first / size)
 
 
-def _equilibrium(problem: QuasiStaticProblem, start: list[Array], most: float) -> _Found | MPMError:
-    """Look for equilibrium with the present strength, and stay there unless the body flows.
+def _equilibria(
+    problem: QuasiStaticProblem, start: list[Array], good: float, factors: list[float], loss: float
+) -> tuple[list[_Found], MPMError | None]:
+    """Look for equilibrium, at a larger factor where the body flows; stay there if it rests.
 
     Whatever else ends it, Ctrl-C or an error in a user's function, leaves the body where it was.
 
     Args:
         problem: It.
         start: Displacements of the bodies' nodes when the reduction began.
-        most: What it may strain by.
+        good: The factor at which it is at rest.
+        factors: What to divide the strength by, in order, until it rests.
+        loss: Relative loss of strength to compare strains with where there is none.
 
     Returns:
-        What was found, or why nothing was.
+        The states that were found, and why there was none at the next factor.
     """
     comm, stages = problem.bodies[0].V.mesh.comm, len(problem.history.stages)
-    found: _Found | MPMError
+    states: list[_Found] = []
+    failure: MPMError | None = None
     with held() as hold:
         before = problem.state.capture()
-        gradients = [body.deformation_gradient for body in problem.bodies]
         try:
-            problem.step()
-            found = _Found(_moved(problem, start), _strained(problem, gradients))
-            if interrupted(comm):
-                settle(comm)
-                raise KeyboardInterrupt
+            for factor in factors:
+                for points in problem.points:
+                    points.laws.weaken(factor)
+                places = [body.centroid.copy() for body in problem.bodies]
+                problem.step()
+                rate = _slid(problem, places) / (np.log(factor / good) or loss)
+                states.append(_Found(factor, _moved(problem, start), rate))
+                if interrupted(comm):
+                    settle(comm)
+                    raise KeyboardInterrupt
+                if not states[-1].flows:
+                    break
+                good = factor
         except FAILURES as error:
-            found = error
+            failure = error
         except BaseException:
             problem.state.adopt(before)
             raise
@@ -338,8 +377,8 @@ def _equilibrium(problem: QuasiStaticProblem, start: list[Array], most: float) -
                 "A stage was begun within strength_reduction(), by a method of the problem's own; "
                 "a factor is of one stage alone."
             )
-        if not isinstance(found, MPMError) and found.strain > most:
+        if states and (failure is not None or states[-1].flows):
             problem.state.adopt(before)
     if interrupted(comm, hold.left):
         raise KeyboardInterrupt
-    return found
+    return states, failure

@@ -18,6 +18,7 @@ from dolfinx import mesh
 
 import mpm_dolfinx as mpm
 from mpm_dolfinx import materials
+from mpm_dolfinx.problems import strength
 
 H = 10.0
 
@@ -81,20 +82,19 @@ def test_slope_of_griffiths_and_lane():
 def test_slope_as_it_stands(step):
     """Steps change the factor by less than a hundredth.
 
-    Long ones fail where the slope stands, and are tried again in shorter ones. Strains go from
-    thousandths of the lost strength to its half within a hundredth of the factor.
+    Long ones fail where the slope stands, and are tried again in shorter ones.
     """
     problem = slope()
     problem.solve(2)
     found = mpm.strength_reduction(problem, step=step)
-    assert found.factor == pytest.approx(1.400, abs=0.006)  # 1.40 by Griffiths & Lane
+    assert found.factor == pytest.approx(1.40, abs=0.01)  # by Griffiths & Lane
     assert 0 < found.above - found.factor <= 0.01 and found.reason == "flow"
     assert found.factors[:2] == [1.0, round(1.0 + step, 2)]
     factors, displacements, rates = found.curve.T
-    stands = rates <= 0.1
+    stands = rates <= 0.03
     np.testing.assert_array_equal(found.factors, factors[stands])
     np.testing.assert_array_equal(found.displacements, displacements[stands])
-    assert rates[0] == 0.0 and rates[1] < 0.01 < 0.1 < rates[~stands].min()
+    assert rates[0] == 0.0 and rates[1] < 0.001 < 0.03 < rates[~stands].min()
 
 
 @pytest.mark.slow
@@ -308,7 +308,7 @@ def test_states_that_cannot_repeat_their_step_are_refused():
         mpm.strength_reduction(problem)
     assert caught.value.particles == [3] and problem.points[0].laws.weakening == 1.0
     problem.before = lambda factor: None
-    with pytest.raises(mpm.MPMError, match=r"above 0\.005: it flows"):
+    with pytest.raises(mpm.MPMError, match=r"above 0\.0015: it flows"):
         problem.particles.load.value = 3.0
         mpm.strength_reduction(problem)
 
@@ -317,13 +317,15 @@ def test_a_factor_at_which_the_body_flows_is_not_tried_again():
     problem = block(kind=Watched)
     problem.solve(2)
     found = mpm.strength_reduction(problem, step=0.5)
-    fell = [f for f in problem.tried if f not in found.factors]
+    beyond = 3.5  # (looked at once, as to whether it comes to rest)
+    assert problem.tried[problem.tried.index(3.0) + 1] == beyond
+    fell = [f for f in problem.tried if f not in found.factors and f != beyond]
     assert fell == sorted(set(fell), reverse=True) and found.above == fell[-1]
     assert found.reason == "flow" and found.failure is None
     last = len(found.factors)
     np.testing.assert_array_equal(found.curve[:last, :2].T, [found.factors, found.displacements])
-    assert found.curve[last, 0] == found.above and np.all(found.curve[last:, 2] > 0.1)
-    assert found.curve[:last, 2].max() <= 0.1 and len(fell) >= 3
+    assert found.curve[last, 0] == found.above and np.all(found.curve[last:, 2] > 0.03)
+    assert found.curve[:last, 2].max() <= 0.03 and len(fell) >= 3
     other = block()
     other.solve(2)
     again = mpm.strength_reduction(other)
@@ -438,3 +440,20 @@ def test_averages_of_carried_and_of_free_nodes_err_to_both_sides(cells):
     assert known == pytest.approx(6.05, abs=0.02)
     assert known < found[0] < (1.0 + 0.55 / cells) * known
     assert (1.0 - 0.8 / cells) * known < found[1] < known
+
+
+def test_what_comes_to_rest_is_no_slide(monkeypatch):
+    """A few cells may give way at one factor, and the body stand at larger ones."""
+    problem = block(kind=Watched)
+    problem.solve(2)
+    slid = strength._slid
+
+    def opened(problem, before):
+        rate = slid(problem, before)
+        return 1.0 if problem.tried[-1] == 1.1 else rate
+
+    monkeypatch.setattr(strength, "_slid", opened)
+    found = mpm.strength_reduction(problem, most=1.3)
+    assert found.factor == 1.3 and found.reason == "most" and found.above == np.inf
+    assert found.factors == pytest.approx([1.0, 1.05, 1.1, 1.15, 1.2, 1.25, 1.3])
+    assert list(found.curve[:, 2] > 0.1) == [factor == 1.1 for factor in found.factors]
