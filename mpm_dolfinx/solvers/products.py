@@ -61,7 +61,7 @@ def keep_rows(
 
 
 def acting(matrix: PETSc.Mat) -> PETSc.Mat:
-    """Return what multiplies as a matrix does, and faster where its rows are known."""
+    """Return a matrix that multiplies as another does, and faster where its rows are known."""
     rows = matrix.getAttr(ROWS)
     if rows is None:
         return matrix

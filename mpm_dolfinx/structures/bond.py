@@ -137,9 +137,9 @@ class Grip:
         trial = before + bond.stiffness * slip
         bears = np.clip(trial, -bond.limit, bond.limit)
         slips = bears != trial
-        # (where a whole bar slips, no change of force, but a tangent that can be solved with)
         secant = bears / np.where(slips, trial, 1.0)
         loose = self._loose(slips, secant, resists)
+        # (where a whole bar slips, no change of force, but a tangent that can be solved with)
         share = np.where(slips, SMALL, 1.0)
         share[loose] = secant[loose]
         tangent = self._sizes * share * bond.stiffness

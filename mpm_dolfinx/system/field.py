@@ -59,7 +59,7 @@ class Motion:
 
     @property
     def action(self) -> PETSc.Mat:
-        """What multiplies as T does."""
+        """A matrix that multiplies as T does."""
         moved = self._moved
         return moved.transfer.action if isinstance(moved, Particles) else moved.T
 

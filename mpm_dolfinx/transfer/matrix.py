@@ -65,9 +65,9 @@ class _Action:
 
 
 def transfer_action(basis: PointBasis, W: fem.FunctionSpace, V: fem.FunctionSpace) -> PETSc.Mat:
-    """Return what multiplies as :func:`transfer_matrix` of one rank does, and has no entries.
+    """Return a matrix without entries that multiplies as :func:`transfer_matrix` of one rank does.
 
-    Those take more memory than all else that is known of T.
+    Entries take more memory than all else that is known of T.
     """
     sizes = [space.dofmap.index_map.size_global * space.dofmap.index_map_bs for space in (W, V)]
     return PETSc.Mat().createPython(sizes, _Action(basis), comm=W.mesh.comm)

@@ -46,7 +46,7 @@ class Transfer:
 
     @cached_property
     def action(self) -> PETSc.Mat:
-        """What multiplies as T does (collective); on one rank T itself is not made for it."""
+        """A matrix that multiplies as T does (collective); on one rank without entries."""
         if self._W.mesh.comm.size > 1:
             return self.T
         return transfer_action(self.rows.basis, self._W, self._V)
