@@ -91,18 +91,17 @@ class _Search:
     def __init__(self, step: float, most: float) -> None:
         self.good, self.bad = 1.0, np.inf
         self._step, self._first, self._most = step, step, most
-        self._flows, self._left = (
-            np.inf,
-            0.0,
-        )  # the least at which it flows, the last left in a leap
+        self._flows = np.inf  # the least at which the body flows
+        self._left = 0.0  # the last that was left in a leap
 
     def next(self) -> list[float]:
         """Return the factor to try, and one beyond it, at which a body that flows may rest."""
         middle = 0.5 * (self.good + self.bad)
         factor = min(self.good + self._step, middle, self._most)
-        beyond = [factor + self._first] if self._flows == np.inf else []
-        # sums of steps are told as 1.2, not as 1.2000000000000002
-        return [round(each, 12) for each in (factor, *beyond)]
+        found = [factor]
+        if self._flows == np.inf and factor < self._most:
+            found.append(min(factor + self._first, self._most))
+        return [round(each, 12) for each in found]  # (1.2, where sums are 1.2000000000000002)
 
     def leap(self) -> list[float]:
         """Return a factor to try, once, beyond one at which Newton's method fails."""
@@ -143,8 +142,8 @@ def strength_reduction(
     body flows where it moves by more than 0.03 of the relative loss of strength times its size,
     both of what moves, and does so again in the next increment: what a few cells do that come to
     rest is no slide.
-    The rule has no length, so how much ground is modelled does not matter. Ground so soft that
-    elastic strains come to hundredths flows a few per cent earlier than stiff one.
+    The rule has no length. Ground so soft that elastic strains come to hundredths flows a few per
+    cent earlier than stiff one.
 
     Newton's method may also fail where there is equilibrium, most where soils do not dilate. So a
     factor at which it has failed is tried again in smaller increments. One at which the body flows
