@@ -231,7 +231,7 @@ def _result(
 
     Args:
         search: It.
-        curve: How far the body has moved, and the rate of its strain, where there was a state.
+        curve: How far the body has moved, and its rate, where there was a state.
         failures: What there was in its place.
     """
     reason: Literal["flow", "no convergence", "most"] = "most"
@@ -342,7 +342,7 @@ def _equilibria(
         start: Displacements of the bodies' nodes when the reduction began.
         good: The factor at which it is at rest.
         factors: What to divide the strength by, in order, until it rests.
-        loss: Relative loss of strength to compare strains with where there is none.
+        loss: Relative loss of strength for the rate where there is none.
 
     Returns:
         The states that were found, and why there was none at the next factor.
