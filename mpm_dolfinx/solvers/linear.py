@@ -88,6 +88,7 @@ class ShiftedFactor:
         self._own_rtol = self._own_type = False
         self._longest = ITERATIONS
         self._bearable = np.inf  # iterations for a decade of the residual
+        self._taken_over = False  # by a factor, where multigrid comes to nothing
         self._dear = False  # what multigrid takes, beside a factorisation
         self._left: float | None = None  # of the residual, by the linear model
         self._bent, self._curved = 1.0, 1.0  # what that lacked in the first solve of a step
@@ -179,6 +180,7 @@ class ShiftedFactor:
         self.D = self._left = None
         self._constrained = levels.constrained
         self._bearable = self._iterations_for_a_factor(size)
+        self._taken_over = size <= self._strategy.taken_over
         iterates = self._prefers_multigrid(size, levels)
         if iterates != self.iterates:
             self._choose(iterates)
@@ -397,7 +399,8 @@ class ShiftedFactor:
         That is the finer of Eisenstat & Walker's (1996) two choices: by how much the linear model
         has missed the residual, and what the last iteration has made of that, to the power of the
         golden ratio; no more than its tolerance asks for. A step begins with what the model
-        lacked at the beginning of the last one. Multigrid may take as long as a factor would.
+        lacked at the beginning of the last one. Where a factor would take over, multigrid may take
+        as long as that.
 
         Args:
             norms: Norms of the residuals so far.
@@ -417,8 +420,10 @@ class ShiftedFactor:
         if norms and norms[-1] > 0.0:
             rtol = max(rtol, min(FINAL * tolerance / norms[-1], INEXACT))
         rtol = max(rtol, SOLVED)
-        bearable = self._bearable * max(-math.log10(rtol), 1.0)
-        self._ksp.setTolerances(rtol=rtol, max_it=math.ceil(min(bearable, self._longest)))
+        most = self._longest
+        if self._taken_over:
+            most = math.ceil(min(self._bearable * max(-math.log10(rtol), 1.0), most))
+        self._ksp.setTolerances(rtol=rtol, max_it=most)
 
     def end(self) -> None:
         """End a step that has converged."""
@@ -461,7 +466,7 @@ class ShiftedFactor:
                 self._assess(self._flexible, b)
                 return None
             self.give_up(shorten)
-        if K.getSize()[0] > self._strategy.taken_over:
+        if not self._taken_over:
             return "as multigrid does not solve for a step; use linear='direct'"
         self._dear = self._linear_solver == "auto"
         self._choose(False)

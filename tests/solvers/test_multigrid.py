@@ -357,6 +357,14 @@ def test_a_factorisation_goes_on_where_multigrid_takes_longer(monkeypatch):
     assert counts[1] < 0.3 * counts[0]
 
 
+def test_multigrid_that_no_factor_takes_over_from_goes_on(monkeypatch):
+    change(monkeypatch, crossover=(700, 700), taken_over=0, bearable=(0.0, 1e9))
+    run = heavy(20, linear_solver="auto")
+    run.solve(steps=1)
+    assert run.history.cutbacks == 0 and run.history.statistics["multigrid_failures"] == 0
+    assert run.history.statistics["krylov_iterations"] > 1
+
+
 def test_a_background_of_degree_3_is_factorised(monkeypatch):
     change(monkeypatch, crossover=(100, 10**6))
     for degree, used in ((2, True), (3, False)):
