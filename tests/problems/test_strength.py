@@ -23,14 +23,19 @@ from mpm_dolfinx.problems import strength
 H = 10.0
 
 
-def slope(cell=1.0, degree=1, **options):
-    """Return the slope of Griffiths & Lane (1999), example 1: 2:1, phi 20, c/(gamma H) 0.05."""
+def slope(cell=1.0, degree=1, beyond=0.0, **options):
+    """Return the slope of Griffiths & Lane (1999), example 1: 2:1, phi 20, c/(gamma H) 0.05.
+
+    Level ground lies beyond its crest.
+    """
     crest, width, weight = 1.2 * H, 2 * H, 20.0
-    n, k = (2 * round(length / cell) // degree for length in (crest + width, H))
-    body = box([0, 0], [crest + width, H], [n, k], QUADRILATERAL)
+    long = beyond + crest + width
+    n, k = (2 * round(length / cell) // degree for length in (long, H))
+    body = box([0, 0], [long, H], [n, k], QUADRILATERAL)
     x = body.geometry.x
-    x[:, 0] *= (crest + width * (1 - x[:, 1] / H)) / (crest + width)
-    cells = [round((crest + width) / cell) + 4, round(H / cell) + 1]
+    own = np.maximum(x[:, 0] - beyond, 0.0)
+    x[:, 0] -= own * (x[:, 1] / H) * width / (crest + width)
+    cells = [round(long / cell) + 4, round(H / cell) + 1]
     V = vectors(box([0, 0], [cell * c for c in cells], cells, QUADRILATERAL), degree)
     return posed(
         mpm.QuasiStaticProblem,
@@ -41,6 +46,19 @@ def slope(cell=1.0, degree=1, **options):
         bcs=[fix(V, at(0, 0), component=0), fix(V, at(1, 0))],
         **options or {"f_bar": "patch"},
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beyond", [4 * H, 20 * H])
+def test_ground_far_from_a_slide_does_not_matter(beyond):
+    """The same cells beside the slope, and no level ground beyond it or many heights."""
+    factors = []
+    for length in (0.0, beyond):
+        problem = slope(2.0, beyond=length)
+        problem.solve(2)
+        factors.append(mpm.strength_reduction(problem).factor)
+    assert factors[0] == pytest.approx(1.44, abs=0.01)  # cells of H/5
+    assert factors[1] == pytest.approx(factors[0], abs=0.01)  # to which it is found
 
 
 def cut(cell=0.125, weight=3.0):
