@@ -15,12 +15,12 @@ import mpm_dolfinx as mpm
 
 LOADS = (20e3, 40e3, 80e3, 160e3)
 DOMAINS = {"quad": "quadrilaterals", "tri": "triangles"}
-OWN = "-collapse_pc_type lu -collapse_pc_factor_mat_solver_type"
+OWN = "-mpm_pc_type lu -mpm_pc_factor_mat_solver_type"
 FACTORS = [
     ("MUMPS, LDLᵀ (default)", ""),
-    ("MUMPS, LDLᵀ, ordering AMD", "-collapse_mat_mumps_icntl_7 0"),
+    ("MUMPS, LDLᵀ, ordering AMD", "-mpm_mat_mumps_icntl_7 0"),
     ("MUMPS, LU", f"{OWN} mumps"),
-    ("PETSc, LU", f"{OWN} petsc -collapse_pc_factor_zeropivot 1e-50"),
+    ("PETSc, LU", f"{OWN} petsc -mpm_pc_factor_zeropivot 1e-50"),
 ]
 
 
