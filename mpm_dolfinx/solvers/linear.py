@@ -21,7 +21,7 @@ from .multigrid import Multigrid
 from .problem import Levels
 from .products import acting
 from .refinement import KRYLOV, Refinement
-from .refusals import options_refused, require_factor
+from .refusals import Failure, failure_of, options_refused, require_factor, warn_of_unread
 from .saddle import SaddleMultigrid
 from .strategies import STRATEGIES, mumps_options
 from .workspace import FACTORS, give_workspace, lacks_workspace
@@ -112,6 +112,7 @@ class ShiftedFactor:
         pc.setType("cholesky" if symmetric else "lu")
         pc.setFactorSolverType("mumps")
         self._options = {prefix + key: value for key, value in options.items()}
+        self._unread = set(self._options)
         self._prefix, self._dim, self._strategy = prefix, dim, STRATEGIES[dim]
         given = {*PETSc.Options(prefix).getAll(), *options}
         said = any(key.startswith(("ksp_", "pc_", "mat_")) for key in given)
@@ -167,6 +168,7 @@ class ShiftedFactor:
         try:
             yield database
         finally:
+            self._unread = {key for key in self._unread if not database.used(key)}
             for key in options:
                 database.delValue(key)
 
@@ -297,6 +299,10 @@ class ShiftedFactor:
         else:
             self._factorise(K, levels, damping)
         self._statistics.count("factorisations")
+        if self._unread:
+            names = [key.removeprefix(self._prefix) for key in sorted(self._unread)]
+            self._unread = set()
+            warn_of_unread(K.comm.tompi4py(), names)
 
     def _factorise(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
         """Make a factor of K with a shift (collective)."""
@@ -430,7 +436,7 @@ class ShiftedFactor:
         self._indefinite = 0
         self._bent = self._curved
 
-    def step(self, b: PETSc.Vec, x: PETSc.Vec, shorten: bool = False) -> str | None:
+    def step(self, b: PETSc.Vec, x: PETSc.Vec, shorten: bool = False) -> Failure | None:
         """Solve for a Newton step, or say why that failed (collective).
 
         Where the method of conjugate gradients has found the tangent indefinite, that of
@@ -448,7 +454,7 @@ class ShiftedFactor:
         """
         if not self.iterates:
             self._ksp.solve(b, x)
-            return _failure(self._ksp)
+            return failure_of(self._ksp)
         K, levels = self.K, self._levels
         assert K is not None and levels is not None
         done = self._iterate(b, x)
@@ -467,14 +473,14 @@ class ShiftedFactor:
                 return None
             self.give_up(shorten)
         if not self._taken_over:
-            return "as multigrid does not solve for a step; use linear='direct'"
+            return Failure("as multigrid does not solve for a step", "use linear='direct'")
         self._dear = self._linear_solver == "auto"
         self._choose(False)
         self._iterate_with_factor(K.getSize()[0])
         self._factorise(K, levels)
         self._statistics.count("multigrid_failures")
         self._ksp.solve(b, x)
-        return _failure(self._ksp)
+        return failure_of(self._ksp)
 
     def give_up(self, shorten: bool) -> None:
         """Give a step up whose tangent is indefinite, a few times, where multigrid solves.
@@ -576,11 +582,3 @@ class ShiftedFactor:
         if package == PETSc.Mat.SolverType.PETSC and not pc.getFailedReason():
             return int(pc.getFactorMatrix().getInertia()[0])
         return int(pc.getFactorMatrix().getMumpsInfog(12)) if package == "mumps" else 0
-
-
-def _failure(ksp: PETSc.KSP) -> str | None:
-    """Return why a solve has failed, ``None`` where it has not."""
-    reason = ksp.getConvergedReason()
-    if reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
-        return "as the factorisation of the tangent failed"
-    return "as a linear solve failed" if reason < 0 else None

@@ -398,9 +398,9 @@ class NewtonSolver:
         R, trial, y = self._room
         residual, judge = now.residual, now.judge
         self._factor.aim(judge.norms, judge.tolerance)
-        why = now.steps.newton(R, y, x)
-        if why is not None:
-            raise self._stopped(why)
+        failure = now.steps.newton(R, y, x)
+        if failure is not None:
+            raise self._stopped(*failure)
         if now.steps.count == 1:
             refined = now.steps.refines
             judge.look_at_first(y, norm(R))
@@ -419,9 +419,11 @@ class NewtonSolver:
         judge.note_step(y, trial)
         trial.copy(x)
 
-    def _stopped(self, why: str) -> ConvergenceError:
+    def _stopped(self, why: str, advice: str = "") -> ConvergenceError:
         residual = self.residuals[-1] if self.residuals else np.nan
-        return ConvergenceError(
+        error = ConvergenceError(
             f"Newton's method stopped after {self.iterations} linear solves at a relative residual "
             f"of {residual:.1e} ({why})"
         )
+        error.advice = advice
+        return error

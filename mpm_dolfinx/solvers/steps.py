@@ -10,6 +10,7 @@ from ..parallel.magnitudes import sign_of_product
 from ..tolerances import SMALL
 from .linear import ShiftedFactor
 from .problem import ReducedProblem
+from .refusals import Failure
 
 __all__ = ["Steps"]
 
@@ -60,7 +61,7 @@ class Steps:
         self._origin = x
         self._negative = self._problem.constrain(y, x, self.solve)
 
-    def newton(self, R: PETSc.Vec, y: PETSc.Vec, x: PETSc.Vec) -> str | None:
+    def newton(self, R: PETSc.Vec, y: PETSc.Vec, x: PETSc.Vec) -> Failure | None:
         """Solve for a Newton step, or say why that failed.
 
         Args:

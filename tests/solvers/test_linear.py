@@ -85,6 +85,16 @@ def test_iterative_solver():
     assert np.abs(moved[0] - moved[1]).max() < 1e-8
 
 
+def test_a_solver_that_does_not_solve_is_told_as_one_and_not_as_a_limit():
+    options = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_max_it": 2}
+    with pytest.raises(mpm.ConvergenceError) as told:
+        scenes.block(petsc_options=options).solve(steps=1)
+    text = str(told.value)
+    assert "ksp_type cg with pc_type jacobi did not solve" in text
+    assert "DIVERGED_MAX_IT after 2 iterations" in text
+    assert "limit" not in text and text.endswith("leave ksp_type and pc_type out.")
+
+
 def test_options_of_the_factor_reach_it():
     # PETSc reads them when it makes the factor, at the first solve.
     problem = scenes.block(petsc_options={"mat_mumps_icntl_7": 0, "mat_mumps_icntl_14": 77})
@@ -92,6 +102,14 @@ def test_options_of_the_factor_reach_it():
     factor = problem.solver.getKSP().getPC().getFactorMatrix()
     assert factor.getMumpsIcntl(7) == 0 and factor.getMumpsIcntl(14) == 77
     assert not PETSc.Options().hasName("mpm_mat_mumps_icntl_7")
+
+
+def test_options_that_petsc_does_not_read_are_named_once():
+    unread = {"pc_typ": "lu", "snes_max_its": 9, "mat_mumps_icntl_14": 40, "ksp_view": None}
+    problem = scenes.block(petsc_options=unread | {"ksp_view": ":/dev/null"})
+    with pytest.warns(UserWarning, match="does not read 'pc_typ' and 'snes_max_its' of") as told:
+        problem.solve(steps=3)
+    assert len(told) == (1 if WORLD.rank == 0 else 0)
 
 
 class Alone:
