@@ -164,6 +164,11 @@ RUNS = {
     ),
     "slope": ("strength", "--case slope --cell 0.2", {"ratio": 1.06}),
     "slope-water": ("strength", "--case slope --water 0.7", {"factor": 1.33}),
+    "dam-recommended": (
+        "strength",
+        "--case dam --water 0.197 --recommended --cell 0.25 --dilation-angle 37",
+        {"ratio": 1.0158, "iterations": 200, "cutbacks": 0},  # 0.03 of their factor
+    ),
     "vertical-cut": ("strength", "--case vertical_cut --cell 0.125", {"ratio": 1.08}),
     "embankment": (
         "embankment",
@@ -465,7 +470,7 @@ KEYS = {
     "taylor": {"length", "radius", "strain", "lift"},
     "sand_column": {"runout", "experiment", "ratio", "outermost", "front", "height_at_wall"},
     "retrogression": {"run_out", "retrogression", "kinetic_left", "alternations"},
-    "strength": {"factor", "exact", "ratio", "plateau", "particles"},
+    "strength": {"factor", "exact", "ratio", "reason", "plateau", "particles"},
     "consolidation": {"pressure_error", "degree", "settlement_error", "particles"},
     "seepage": {"discharge", "exact", "error"},
     "cone": {"factor", "exact", "rise"},
@@ -530,6 +535,8 @@ def test_numbers(case, capfd):
         assert degree == 1 or numbers["unknowns"] < 1.25 * numbers["unknowns_carried"]
     if name == "block3d":
         assert abs(numbers["height"] - 1.2) < 1e-3
+    if case == "dam-recommended":
+        assert numbers["ratio"] > 0.9842 and numbers["reason"] == "flow"
     if name in ("strength", "footing", "penetration") and numbers.get("ratio"):
         assert numbers["ratio"] > 0.9
     if case == "softening":
