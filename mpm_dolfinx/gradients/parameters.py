@@ -156,7 +156,7 @@ def as_parameter(given: Any, problem: Problem, scale: float | None) -> Parameter
             )
         value: Any = thing.parameters[name]
         if isinstance(value, fem.Constant | fem.Function):
-            thing, direction = value, np.ones(1)
+            thing, direction = value, 1.0
         else:
             size = largest(np.abs(value), problem) if scale is None else scale
             known = [law for points in problem.points for law in points.laws.given]

@@ -192,6 +192,13 @@ def test_numbers_of_laws_functions_and_directions():
     scene.problem.solve(3)
     plain = gradient.of(lambda: scene.particles.displacement.x.array)
     assert size(plain[:, 0] - gradient.displacement[0].x.array) < 1e-8 * size(plain[:, 0])
+    material = {"material": lambda body: materials.Hencky(fem.Constant(body, 2e4), 0.3)}
+    scene = Slump(lambda: None, {"weight": 1e3}, **material)
+    law = scene.problem.points[0].laws.given[0]
+    gradient = mpm.Sensitivity(scene.problem, [(law, "young")])
+    scene.problem.solve(3)
+    constant = gradient.of(lambda: scene.particles.displacement.x.array)
+    assert size(constant[:, 0] - plain[:, 0]) < 1e-7 * size(plain[:, 0])
     scene = Slump(lambda: None, {"weight": 1e3}, material=lambda body: _layered(body, 2e4))
     young = scene.problem.points[0].laws.given[0].parameters["young"]
     upper = fem.Function(young.function_space)
