@@ -15,6 +15,7 @@ from ..errors import MPMError
 from ..history import Statistics
 from ..parallel.magnitudes import norm, unit_sized
 from ..tolerances import ARMIJO
+from .steps import Steps
 
 __all__ = ["LineSearch", "Rules", "stalled"]
 
@@ -101,7 +102,9 @@ class LineSearch:
     iterations later. If seven have not brought the residual below what it was, or before that a
     domain turns inside out, the response is no longer smooth or a linear solve breaks down, the
     search withdraws to where it was (the watchdog of Chamberlain, Powell, Lemarechal & Pedersen
-    1982), once in a solve. What is left is halved.
+    1982), once in a solve. What is left is halved. Where even then domains turn inside out, as of
+    sand whose points have parted and resist nothing, the step is that of a damped tangent, in the
+    first seven iterations: a body at its limit would creep on by it.
 
     Where points yield, the step then goes on to where the work is at most 0.3 of its start, by the
     secants of regula falsi: a body that flows has kinks, and Newton steps that are only just
@@ -110,30 +113,30 @@ class LineSearch:
     Args:
         rules: The rules of the solve.
         evaluate: Evaluates the residual at unknowns into ``F``; returns a failure or ``None``.
-        uphill: Says whether the step for a residual is not that of a positive definite tangent.
-        redirect: Replaces it by a damped one that is, or reverses it; returns whether it is
-            reversed.
+        steps: Says whether a step is not that of a positive definite tangent, and finds others.
         smooth: Says whether no history changes in the residual evaluated last.
         statistics: Where to count.
+
+    Attributes:
+        damps: Whether a step may be damped; where there is another start, that does better.
     """
 
     def __init__(
         self,
         rules: Rules,
         evaluate: Callable[[PETSc.Vec], MPMError | None],
-        uphill: Callable[[PETSc.Vec, PETSc.Vec], bool],
-        redirect: Callable[[PETSc.Vec, PETSc.Vec], bool],
+        steps: Steps,
         smooth: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
         self._rules = rules
         self._evaluate = evaluate
-        self._uphill = uphill
-        self._redirect = redirect
+        self._steps = steps
         self._smooth = smooth
         self._statistics = statistics
         self._trusted: _Step | None = None
         self._since, self._may_trust = 0, True
+        self.damps = True
 
     def __call__(self, x: PETSc.Vec, y: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> bool:
         """Choose the step to ``x - y`` (collective).
@@ -154,9 +157,9 @@ class LineSearch:
         start = F.copy()
         if self._reduces(step, F, trial) and not self._overdue(F):
             return self._sharpen(step, 1.0, F, trial)
-        if self._trusted is None and self._uphill(start, y):
+        if self._trusted is None and self._steps.uphill(start, y):
             self._statistics.count("redirections")
-            step = _Step.of(x, y, start, self._redirect(start, y))
+            step = _Step.of(x, y, start, self._steps.redirect(start, y))
             if not self._reduces(step, F, trial):
                 self._halve(step, F, trial)
             return True
@@ -168,6 +171,9 @@ class LineSearch:
             return False
         if self._trusted is None:
             self._halve(step, F, trial)
+            soon = self.damps and self._since <= PATIENCE // 2
+            if soon and not np.isfinite(norm(F)):
+                self._damp(step, start, F, trial)
         else:
             self.withdraw(x, y, F, trial)
         return True
@@ -219,6 +225,16 @@ class LineSearch:
             self._statistics.count("halvings")
             if self._reduces(step, F, trial):
                 self._sharpen(step, 2.0 ** (halvings + 1), F, trial)
+                break
+
+    def _damp(self, step: _Step, start: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> None:
+        """Damp the step, more and more, until domains bear it and norm or work fall far enough."""
+        for _ in self._steps.damped(start, step.y):
+            damped = _Step.of(step.x, step.y, start)
+            if self._reduces(damped, F, trial):
+                break
+            if np.isfinite(norm(F)):
+                self._halve(damped, F, trial)
                 break
 
     def _sharpen(self, step: _Step, longest: float, F: PETSc.Vec, trial: PETSc.Vec) -> bool:

@@ -307,7 +307,7 @@ class ShiftedFactor:
     def _factorise(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
         """Make a factor of K with a shift (collective)."""
         new = self.K is not K
-        diagonal = damping * levels.diagonal(K) if damping > self.shift else self.D
+        diagonal = self._damping(K, levels, damping) if damping > self.shift else self.D
         if diagonal is None:
             self.P = K
         elif new or self.P is K:
@@ -339,6 +339,12 @@ class ShiftedFactor:
             with self._own_options(K.getSize()[0]), options_refused():
                 self._ksp.setUp()  # where the factor is made, which reads options of its own
                 give_workspace(self._ksp, self.K, self.P, self._statistics)
+
+    def _damping(self, K: PETSc.Mat, levels: Levels, relative: float) -> PETSc.Vec:
+        """Return a diagonal in proportion to that of the solve's first tangent, or of K."""
+        if self.D is None:
+            return relative * levels.diagonal(K)
+        return relative / self.shift * self.D
 
     def _split(self, splits: Sequence[tuple[str, slice]]) -> None:
         """Tell a PC of type fieldsplit where the unknowns of each field are, by name (collective).
@@ -375,7 +381,7 @@ class ShiftedFactor:
             matrix = K if not damped and self._sweepable(K) else None
             if matrix is None:
                 relative = damping if damped else HALF_DIGITS
-                matrix = self._shifted_copy(K, relative * levels.diagonal(K))
+                matrix = self._shifted_copy(K, self._damping(K, levels, relative))
             if self._symmetric:
                 matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._ksp.setOperators(acting(matrix if damped else K), matrix)

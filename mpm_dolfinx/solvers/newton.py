@@ -285,9 +285,7 @@ class NewtonSolver:
         search = None
         if self._searches:
             smooth = problem.terms.smooth
-            search = LineSearch(
-                rules, residual.at, steps.uphill, steps.redirect, smooth, statistics
-            )
+            search = LineSearch(rules, residual.at, steps, smooth, statistics)
         now = Attempt(problem, shorten, residual, steps, judge, search)
         self._attempt = now
         return now
@@ -309,6 +307,8 @@ class NewtonSolver:
         predicted = predicts and self._predict(x, judge.first)
         self.has_another_way = self.has_another_way or (predicted and not now.shorten)
         self._predictions.lead = not predicted
+        if now.search is not None:
+            now.search.damps = not predicted
         now.residual.centre = x.copy()
         steps.follow(K=None if predicted else K)
         if imposed and not predicted:

@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from petsc4py import PETSc
 
 from ..parallel.magnitudes import sign_of_product
@@ -108,11 +110,21 @@ class Steps:
             return True
         self.indefinite += 1
         self._factor.give_up(self._shortens)
+        for _ in self.damped(R, y):
+            if not self.uphill(R, y):
+                break
+        return False
+
+    def damped(self, R: PETSc.Vec, y: PETSc.Vec) -> Iterator[None]:
+        """Replace a step by those of the last tangent with more and more damping, one at a time.
+
+        Args:
+            R: The residual.
+            y: The step.
+        """
         for damping in DAMPINGS:
             self.follow(damping, self._factor.K)
             self._factor.solve(R, y)
             self._negative = self._problem.constrain(y, self._origin, self._factor.solve)
             self.count += 1
-            if not self.uphill(R, y):
-                break
-        return False
+            yield
