@@ -39,6 +39,9 @@ ELASTIC = 0.02
 OF_MOTION, OF_LENGTH = 8.0, 5.0
 #: The same where an obstacle drives the motion: nothing relaxes what it has pushed aside wrongly.
 OF_DRIVEN = 1.5
+#: Steps of the smallest size in a row, with too large an error, that end a run: after a jump, as
+#: where a body snaps through, two are.
+MISSED = 10
 
 
 @dataclass(frozen=True)
@@ -175,7 +178,7 @@ class ErrorControl:
         self._before: float | None = None
         self._ratio = 0.0
         self._holds = self._touches = False
-        self._unkept = 0
+        self._unkept = self._in_a_row = 0
 
     @property
     def asked(self) -> list[Any]:
@@ -248,16 +251,18 @@ class ErrorControl:
     def reject(self) -> bool:
         """Make the step smaller that was judged last, if its error is too large; tell whether.
 
-        The smallest is not, and counted. Nor is the first one, as half of it counts as its error,
-        however small it is; but what contact moves wrongly at first stays, so that with it the
-        first step is made smaller, once.
+        The smallest is not, and counted: see :attr:`failure`. Nor is the first one, as half of it
+        counts as its error, however small it is; but what contact moves wrongly at first stays, so
+        that with it the first step is made smaller, once.
         """
         tried = self.target - self._now
         kept = self._before is None and (tried < FIRST or not self._touches)
         if self._ratio <= REJECTED or kept:
+            self._in_a_row = 0
             return False
         if self._smallest:
             self._unkept += 1
+            self._in_a_row += 1
             return False
         self._size = max(tried * max(LEAST, SAFETY / math.sqrt(self._ratio)), self._least)
         return True
@@ -267,13 +272,29 @@ class ErrorControl:
         """Warning that the step judged last misses the tolerance, given once."""
         if self._unkept != 1 or self._ratio <= REJECTED or not self._smallest:
             return None
-        length = "" if self._length is None else f" and length={self._length:g}"
         return (
-            f"tolerance={self._tolerance:g}{length} cannot be kept: a step of the smallest size, "
-            f"{self._least:.3g} of the load, had {self._ratio:.3g} times the allowed error, and "
-            f"the run goes on with such steps, up to {math.ceil((1.0 - self._now) / self._least)} "
-            "of them; give larger ones."
+            f"{self._missed}: a step of the smallest size, {self._least:.3g} of the run, had "
+            f"{self._ratio:.3g} times the allowed error; {MISSED} such steps in a row end it."
         )
+
+    @property
+    def failure(self) -> str | None:
+        """Why the run ends with the step judged last, if it does."""
+        if self._in_a_row < MISSED:
+            return None
+        return (
+            f"{self._missed}: {MISSED} steps in a row of the smallest size, {self._least:.3g} of "
+            f"the run, had more than {REJECTED:g} times the allowed error, the last one "
+            f"{self._ratio:.3g} times; if bodies move on here under hardly any more load, as at a "
+            "limit load, displacement control (control=...) or a motion follows them, else give a "
+            "larger tolerance, or a number of steps"
+        )
+
+    @property
+    def _missed(self) -> str:
+        """Beginning of a sentence on steps that miss the tolerance."""
+        length = "" if self._length is None else f" and length={self._length:g}"
+        return f"tolerance={self._tolerance:g}{length} cannot be kept"
 
     def accept(self, iterations: int) -> None:
         """Go to the target, and choose the next step by the error that was judged last."""

@@ -420,6 +420,8 @@ class Stepper:
             ratio = control.judge(error_of_step(trial.reduced, size, comm))
             tried = run.size
             if not control.reject():
+                if (sentence := control.failure) is not None:
+                    raise MPMError(sentence)
                 if (sentence := control.complaint) is not None:
                     warn(comm, sentence)
                 return False

@@ -118,25 +118,35 @@ def test_cutbacks_come_to_an_end_wherever_a_run_is():
 
 
 def test_a_tolerance_that_cannot_be_kept_is_told_once():
+    # Every other step is good: a run that is only missed now and then goes on.
     control = ErrorControl(1e-3)
-    told = []
-    while not control.finished:
-        control.judge(StepError(1e3 * (control.target - control.share), 1.0, False))
+    told, number = [], 0
+    while control.share < 0.06:
+        good = number % 2 and control.target - control.share < 1e-4
+        control.judge(StepError(0.0 if good else 1e3 * control.target, 1.0, False))
         if not control.reject():
             told += [] if control.complaint is None else [(control.share, control.complaint)]
+            assert control.failure is None
             control.accept(5)
+            number += 1
     assert len(told) == 1 and told[0][0] < 0.1
     assert "tolerance=0.001 cannot be kept: a step of the smallest" in told[0][1]
 
 
 @pytest.mark.parametrize("options", [{"tolerance": 1e-8}, {"length": 1e-9}], ids=str)
-def test_a_run_says_early_that_it_cannot_keep_its_tolerance(options):
+def test_a_run_that_cannot_keep_its_tolerance_ends_early(options):
+    # It had gone on with up to twenty thousand steps of the smallest size.
     problem = column(60e3)
     with pytest.warns(UserWarning, match="cannot be kept") if WORLD.rank == 0 else nullcontext():
-        for number, _ in enumerate(problem.steps("auto", **options)):
-            if number == 15:
-                break
-    assert 0.0 < problem.history.load[-1] < 0.1
+        with pytest.raises(mpm.MPMError, match="10 steps in a row of the smallest") as caught:
+            problem.solve("auto", **options)
+    history = problem.history
+    assert all(text == str(caught.value) for text in WORLD.allgather(str(caught.value)))
+    assert caught.value.load == history.load[-1]
+    assert 0.05 < history.load[-1] < 0.06 and len(history.steps) <= 12
+    assert problem.particles.load.value == history.load[-1]
+    next(problem.steps(20))
+    assert history.load[-1] > 0.09
 
 
 def test_sizes_follow_the_second_difference():
