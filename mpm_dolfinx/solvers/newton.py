@@ -176,6 +176,7 @@ class NewtonSolver:
         self.gave_up = False
         if self._attempt is not None:
             self._attempt.yielding.clear()
+            self._attempt.steps.count = self._attempt.steps.indefinite = 0
 
     def release(self) -> None:
         """Let go of the last tangent, which is needed no more (collective)."""

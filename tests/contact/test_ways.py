@@ -27,6 +27,10 @@ def test_an_obstacle_does_not_jump_through_a_body():
     ):
         problem.step()
     assert die.offset.tolist() == [0.0, -0.4] and start.tolist() == [0.0, 0.0]
+    problem.solve(1, update=lambda t: die.move((0.0, -0.4 - 0.3 * t)))
+    taken_back = problem.history.taken_back
+    refused = [a.iterations for a in taken_back if "moves through" in a.reason]
+    assert refused and set(refused) == {0}  # nothing was solved
 
 
 #: Obstacles that are thinner than a domain, above a unit block.
