@@ -307,7 +307,8 @@ class Structure(Term):
         nodal = stretched(self._rule, self.law, places, self.state.offset, self._step.present)
         if self._grip is not None:
             before = self.state.bond[self._grip.nodes]
-            skin = self._grip.skin(before, self._slipped, ~nodal.special.all(axis=1))
+            resists = (self._step.present > 0.0) & ~nodal.special.all(axis=1)
+            skin = self._grip.skin(before, self._slipped, resists)
         forces = np.zeros_like(self.layout.nodes)
         np.add.at(forces, self.layout.cells, nodal.forces)
         self._now = _Now(nodal, forces, skin, slip)

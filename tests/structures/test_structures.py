@@ -856,3 +856,32 @@ def test_in_motion_a_bar_is_in_balance_with_what_holds_it(scheme, limits, limit)
     assert most == pytest.approx(limit) and np.abs(nail.state.slip).max() > 1e-4
     assert problem.history.cutbacks == 0
     assert max(step.iterations for step in problem.history.steps) < 10
+
+
+def test_each_piece_of_a_bar_that_was_cut_slips_by_itself():
+    """Nothing is pulled across the part that was removed, and no piece slips without bound."""
+    V = vectors(box([-1, -1], [5, 2], [24, 12], QUADRILATERAL))
+    domain = box([0, 0], [4, 1], [16, 4], QUADRILATERAL)
+    block = mpm.Particles(domain, V, outside="delete", quadrature_degree=2)
+    nail = mpm.Truss(block, line((0.3, 0.4), (3.7, 0.4), 17), 50.0, bond=mpm.Bond(50.0, 0.01))
+    aside = fem.Constant(V.mesh, np.zeros(2))
+    left, right = (
+        fem.locate_dofs_geometrical(V, where)
+        for where in (lambda x: x[0] < 0.01, lambda x: x[0] > 3.99)
+    )
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(block, Hencky(20.0, 0.3)),
+        bcs=[fem.dirichletbc(np.zeros(2), left, V), fem.dirichletbc(aside, right, V)],
+        terms=[nail],
+    )
+    problem.solve(2, update=lambda t: aside.value.put(0, 0.05 * t))
+    problem.remove(mpm.region(x=(1.7, 2.3)))
+    problem.solve()
+    problem.solve(4, update=lambda t: aside.value.put(0, 0.05 + 0.3 * t))
+    assert problem.history.cutbacks == 0
+    assert np.abs(nail.state.bond).max() == pytest.approx(0.01)
+    gone = np.flatnonzero(nail.force == 0.0)
+    sizes = np.full(18, 0.2)
+    sizes[[0, -1]] = 0.1
+    for piece in (slice(0, gone[0] + 1), slice(gone[-1] + 1, None)):
+        assert abs(np.sum((sizes * nail.state.bond)[piece])) < 1e-8
