@@ -32,7 +32,9 @@ if [[ ${1:-} == --all ]]; then
     fi
 elif (($# == 0)); then
     several=(--between-ranks)
-    few=(parallel background meshes particles physics/test_parallel.py problems/test_fields.py)
+    # (Signals, forms and communicators have been asked on two, and take seconds each.)
+    few=(parallel/test_{balance,bisection,boundary,exchange,given,refused_calls}.py
+        background meshes particles physics/test_parallel.py problems/test_fields.py)
     few=("${few[@]/#/tests/}")
     echo "The quick tests. Those of one folder or file take seconds: make test ARGS=tests/materials," \
         "NP=1 for one rank alone; make test-all runs all, also on four ranks."

@@ -7,16 +7,20 @@ import re
 import pytest
 
 #: Of a family about ranks, how many sets of parameters more than two ranks run.
-MOST = 11
+MOST = 3
+#: Steps that are taken back, on all ranks: how, depends on no term or law.
+FAILURES = re.compile("ends_on|fail|interrupt|signal")
 #: What ranks do together besides solving: files, failures, other meshes, features with each other.
 TOGETHER = (
     re.compile("checkpoint|restart|restore"),
-    re.compile("ends_on|fail|interrupt|signal"),
+    FAILURES,
     re.compile("mesh|repartition|split"),
     re.compile("combination|feature|scene"),
 )
 #: Errors of what users give, which ranks agree on: all that is public is asked in tests/parallel.
 REFUSALS = re.compile("refuse|no_sense|what_cannot_be|not_go_together")
+#: Ranks that do not get as far as an answer.
+APART = re.compile("differ|fail|refuse|one_rank|out_of_range")
 #: Whole runs, whose answers one rank has looked at: what these are made of has tests of its own.
 WHOLE_RUNS = re.compile(
     r"tests/(boundary|constitutive|contact|gradients|plot|problems|solvers|stabilisation|stepping|"
@@ -61,8 +65,9 @@ def between_ranks(items, ranks):
       nothing else,
     - one set of parameters of each other function, which is no refusal: a ghost, a boundary between
       parts or a collective call does not know Poisson's ratio,
-    - of a file of whole runs only the first function, and the first about each thing that ranks do
-      together; of physics, and of what a rank does for itself, only the latter.
+    - of a file of whole runs only a function about ranks, or the first where there is none, and the
+      first about each thing that ranks do together; of physics, and of what a rank does for itself,
+      only the latter; of steps that fail and are taken back one in a folder.
 
     Args:
         items: The tests.
@@ -71,14 +76,20 @@ def between_ranks(items, ranks):
     Returns:
         The tests to run, and the others.
     """
-    chosen, others, sets, met = [], [], {}, set()
-    for item in items:
-        path, name = item.nodeid.split("::")[0], getattr(item, "originalname", item.name)
+    named = [(i.nodeid.split("::")[0], getattr(i, "originalname", i.name)) for i in items]
+    chosen, others, sets = [], [], {}
+    met = {(path, "whole") for path, name in named if "rank" in name and not APART.search(name)}
+    for item, (path, name) in zip(items, named, strict=True):
         place = sets[path, name] = sets.get((path, name), -1) + 1
         if "parallel" in path or "rank" in name or item.get_closest_marker("mpi"):
             (others if ranks > 2 and place >= MOST else chosen).append(item)
             continue
-        things = {(path, k) for k, thing in enumerate(TOGETHER) if thing.search(name)}
+        folder = path.rpartition("/")[0]
+        things = {
+            (folder if thing is FAILURES else path, thing)
+            for thing in TOGETHER
+            if thing.search(name)
+        }
         if not ALONE.search(path):
             things.add((path, "whole" if WHOLE_RUNS.search(path) else name))
         if ranks > 2 or place or things <= met or REFUSALS.search(name):
