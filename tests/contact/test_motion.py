@@ -54,7 +54,7 @@ def falling(shape, friction=0.0, comm=WORLD, turn=0.0, **options):
     ("shape", "turn"),
     [
         (contact.plane((0.0, 0.5), (0.1, 1.0)), 0.5),
-        (contact.disc((0.4, 0.2), 0.3), 0.0),
+        pytest.param(contact.disc((0.4, 0.2), 0.3), 0.0, marks=pytest.mark.slow),
         pytest.param(contact.box((0.2, 0.0), (0.6, 0.5), 0.1), 0.0, marks=pytest.mark.slow),
     ],
     ids=["plane", "disc", "box"],

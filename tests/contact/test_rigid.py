@@ -273,15 +273,21 @@ def test_contact_follows_other_meshes_of_the_body(what):
         close(told(die), told(alone), 1e-6)
 
 
+@pytest.fixture(scope="module")
+def on_a_fine_grid():
+    """The force on a die that is dragged over finer domains."""
+    problem, die, path = dragged(n=12, friction=0.2)
+    problem.solve(10, update=path)
+    return die.reaction
+
+
 @pytest.mark.parametrize("method", ["cpdi2", "cpdi", "gimp", "mpm"])
-def test_all_methods_feel_an_obstacle(method):
+def test_all_methods_feel_an_obstacle(method, on_a_fine_grid):
     problem, die, path = dragged(method=method, friction=0.2)
     problem.solve(10, update=path)
-    other, alone, path = dragged(n=12, friction=0.2)
-    other.solve(10, update=path)
     base = problem.reaction(problem.bcs[0])
     assert np.abs(base + die.reaction).max() < 1e-6 * np.abs(base).max()
-    assert die.reaction[1] == pytest.approx(alone.reaction[1], rel=0.25)
+    assert die.reaction[1] == pytest.approx(on_a_fine_grid[1], rel=0.25)
     assert abs(die.reaction[0] / die.reaction[1]) == pytest.approx(0.2, abs=0.05)
 
 

@@ -104,7 +104,7 @@ def run(problem, steps=12):
     ("cells", "options"),
     [
         (30, {}),
-        (60, {}),
+        pytest.param(60, {}, marks=pytest.mark.slow),
         (60, {"law": "small"}),
         (60, {"law": "tresca"}),
         (30, {"f_bar": "patch"}),

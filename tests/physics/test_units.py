@@ -5,6 +5,7 @@
 import numpy as np
 import pytest
 import scenes
+from marks import slow
 from posed import posed
 from scenes import QUADRILATERAL
 
@@ -64,7 +65,7 @@ def result(problem):
     return p.centroid, p.stress, p.plastic_strain, np.array(reactions)
 
 
-@pytest.mark.parametrize("name", ["A", "B", "C"])
+@pytest.mark.parametrize("name", ["A", *slow("B"), "C"])
 def test_units(name):
     problem, steps = case(name)
     problem.solve(steps=steps)
