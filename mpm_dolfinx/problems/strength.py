@@ -153,6 +153,10 @@ def strength_reduction(
     Where something else ends it, Ctrl-C or an error in a function of yours, the body is left in the
     last state of equilibrium too, with the strength that it was given.
 
+    A body with a factor below 1 slides while it is loaded, or does not bear the whole load. Where
+    it comes to rest it just stands, and there is a warning. Load it with twice the strength, and
+    take half of the factor that is found.
+
     Coarse cells may find too high a factor: a vertical cut 5 % with cells of a tenth of its height,
     3 % with half of that. Look at two grids.
 
@@ -200,7 +204,9 @@ def strength_reduction(
         for points in problem.points:
             points.laws.weaken(1.0)
     result = _result(search, curve, failures)
-    if result.failure is not None:
+    if result.factor == 1.0:
+        _warn_of_slide(problem, result)
+    elif result.failure is not None:
         _warn_if_at_rest(problem, result, curve[result.factor][1])
     return result
 
@@ -218,8 +224,8 @@ def _at_rest(found: tuple[list[_Found], MPMError | None], loss: float) -> float:
         raise MPMError(
             "strength_reduction() begins with a step at the present loads and strength, in which "
             f"the body moves by {states[0].way:.3g}, by {states[0].rate * loss:.3g} of the size of "
-            f"what moves, above {FLOW * loss:g}: it flows; let it come to rest by problem.step(), "
-            "or weaken it less."
+            f"what moves, above {FLOW * loss:g}: it flows; let it settle by problem.step(), or, "
+            "where it slides, load it with twice the strength, and take half of the factor."
         )
     return states[0].way
 
@@ -244,6 +250,16 @@ def _result(
     factors, displacements = rows[rows[:, 0] <= search.good, :2].T.tolist()
     return StrengthReduction(
         search.good, float(search.bad), factors, displacements, reason, failure, rows
+    )
+
+
+def _warn_of_slide(problem: QuasiStaticProblem, result: StrengthReduction) -> None:
+    """Warn where the body bears no loss of strength: it may have slid already (collective)."""
+    warn(
+        problem.bodies[0].mesh.comm,
+        "The factor of safety may be far below 1: the body bears no loss of strength, not even at "
+        f"{result.above:g}, as one that slid while it was loaded, to where it just stands. "
+        "Load it with twice the strength, and take half of the factor that is found.",
     )
 
 

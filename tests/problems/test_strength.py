@@ -314,6 +314,24 @@ def test_failures_far_from_a_slide_are_told():
     np.testing.assert_array_equal(found.curve[:, :2].T, [found.factors, found.displacements])
 
 
+def test_a_body_that_slid_while_it_was_loaded_has_no_factor_of_one():
+    """It comes to rest where it just stands; with all strengths its factor is in proportion."""
+    found = []
+    for cohesion, rests in ((4.0, 0), (2.0, 1)):
+        problem = block(materials.Tresca(1e3, 0.3, cohesion=cohesion))
+        problem.solve(2)
+        for _ in range(rests):
+            problem.step()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found.append(mpm.strength_reduction(problem).factor)
+        told = [str(one.message) for one in caught if "far below 1" in str(one.message)]
+        assert len(told) == (rests if WORLD.rank == 0 else 0)
+    stood, slid = found
+    assert slid == 1.0 and stood / 2.0 < 0.9
+    assert stood == pytest.approx(2.5 * 4.0 / 6.0, rel=0.02)  # (as it is with a cohesion of 6)
+
+
 def test_states_that_cannot_repeat_their_step_are_refused():
     problem = block(kind=Watched)
     problem.solve(2)
