@@ -291,7 +291,7 @@ class Run:
             )
         return (
             f"{found} {self.control.target:.6g}; if that is a limit load, displacement control "
-            "(control=...) goes on beyond it"
+            "(control=...) or a motion (DynamicProblem) goes on beyond it"
         )
 
     def dirichlet_values(self, totals: list[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
