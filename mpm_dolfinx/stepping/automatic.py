@@ -39,9 +39,6 @@ ELASTIC = 0.02
 OF_MOTION, OF_LENGTH = 8.0, 5.0
 #: The same where an obstacle drives the motion: nothing relaxes what it has pushed aside wrongly.
 OF_DRIVEN = 1.5
-#: Steps of the smallest size in a row, with too large an error, that end a run: after a jump, as
-#: where a body snaps through, two are.
-MISSED = 10
 
 
 @dataclass(frozen=True)
@@ -274,16 +271,20 @@ class ErrorControl:
             return None
         return (
             f"{self._missed}: a step of the smallest size, {self._least:.3g} of the run, had "
-            f"{self._ratio:.3g} times the allowed error; {MISSED} such steps in a row end it."
+            f"{self._ratio:.3g} times the allowed error; {MOST_HALVINGS} such steps in a row end it."
         )
 
     @property
     def failure(self) -> str | None:
-        """Why the run ends with the step judged last, if it does."""
-        if self._in_a_row < MISSED:
+        """Why the run ends with the step judged last, if it does.
+
+        As many steps in a row miss as one may be halved; after a jump, as where a body snaps
+        through, two do.
+        """
+        if self._in_a_row < MOST_HALVINGS:
             return None
         return (
-            f"{self._missed}: {MISSED} steps in a row of the smallest size, {self._least:.3g} of "
+            f"{self._missed}: {MOST_HALVINGS} steps in a row of the smallest size, {self._least:.3g} of "
             f"the run, had more than {REJECTED:g} times the allowed error, the last one "
             f"{self._ratio:.3g} times; if bodies move on here under hardly any more load, as at a "
             "limit load, displacement control (control=...) or a motion follows them, else give a "
