@@ -152,7 +152,7 @@ class ShiftedFactor:
         if package != (package := self._ksp.getPC().getFactorSolverType()):
             why += ", few unknowns"
         elif self._dear:
-            why += ", after multigrid came to nothing"
+            why += ", after multigrid took longer than a factor or came to nothing"
         return f"{kind} by {NAMES.get(package, package)} ({why})"
 
     @contextmanager
@@ -513,7 +513,8 @@ class ShiftedFactor:
         self._left = left
         if 0.0 < left < size:
             decades = max(math.log10(size / left), 1.0)
-            self._dear = ksp.getIterationNumber() > decades * self._bearable
+            dear = ksp.getIterationNumber() > decades * self._bearable
+            self._dear = self._taken_over and dear
 
     def _does(self, b: PETSc.Vec) -> bool:
         """Return whether a solve that round-off has ended leaves a residual that does for Newton.
