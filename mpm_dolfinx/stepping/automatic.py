@@ -271,7 +271,8 @@ class ErrorControl:
             return None
         return (
             f"{self._missed}: a step of the smallest size, {self._least:.3g} of the run, had "
-            f"{self._ratio:.3g} times the allowed error; {MOST_HALVINGS} such steps in a row end it."
+            f"{self._ratio:.3g} times the allowed error; {MOST_HALVINGS} such steps in a row end "
+            "it."
         )
 
     @property
@@ -284,8 +285,9 @@ class ErrorControl:
         if self._in_a_row < MOST_HALVINGS:
             return None
         return (
-            f"{self._missed}: {MOST_HALVINGS} steps in a row of the smallest size, {self._least:.3g} of "
-            f"the run, had more than {REJECTED:g} times the allowed error, the last one "
+            f"{self._missed}: {MOST_HALVINGS} steps in a row of the smallest size, "
+            f"{self._least:.3g} of the run, had more than {REJECTED:g} times the allowed error, "
+            "the last one "
             f"{self._ratio:.3g} times; if bodies move on here under hardly any more load, as at a "
             "limit load, displacement control (control=...) or a motion follows them, else give a "
             "larger tolerance, or a number of steps"
