@@ -12,30 +12,22 @@ from dolfinx import la
 from ..particles.particles import Particles
 from .points import MaterialPoints
 
-__all__ = ["stress_errors"]
+__all__ = ["recovered", "stress_errors"]
 
 type Array = NDArray[np.float64]
 
 
-def stress_errors(
-    particles: Particles, points: MaterialPoints, moduli: tuple[Array, Array]
-) -> Array:
-    """Return the energy by which the stress differs from a continuous one (collective).
+def recovered(particles: Particles, points: MaterialPoints) -> tuple[Array, Array]:
+    """Return the stress at all points and a continuous one, ``(n, nq, 3, 3)`` (collective).
 
     It is the stress beyond the one that the body began with, which is no answer of its elements.
     The continuous stress is linear in the domains' shape functions, with values at nodes that are
     means of the domains around, each continued to its nodes as far as its points tell
-    (Zienkiewicz & Zhu 1987). Domains of other laws have means of their own. With a pressure of
-    its own, the volume strain that it leaves counts as strain that resists as shear does (Verfuerth
-    1989, in whose estimate it is beside the residual of the forces).
+    (Zienkiewicz & Zhu 1987). Domains of other laws have means of their own.
 
     Args:
         particles: The body.
         points: Its material.
-        moduli: Bulk and shear modulus of each of its points, undeformed.
-
-    Returns:
-        ``int ds : C^-1 : ds + 2/3 mu g^2 dX``, shape ``(n,)``.
     """
     stress = points.last.gained_stress(particles.point_deformation_gradient)
     stress = stress + np.broadcast_to(points.last.recovery, (len(stress), 3, 3))[:, None]
@@ -47,6 +39,27 @@ def stress_errors(
         mine = points.laws.numbers == law
         means = _means(particles, at_nodes, weights.sum(axis=1) * mine)
         smooth[mine] = np.einsum("qk,nkij->nqij", shapes, means[mine])
+    return stress, smooth
+
+
+def stress_errors(
+    particles: Particles, points: MaterialPoints, moduli: tuple[Array, Array]
+) -> Array:
+    """Return the energy by which the stress differs from a continuous one (collective).
+
+    With a pressure of its own, the volume strain that it leaves counts as strain that resists as
+    shear does (Verfuerth 1989, in whose estimate it is beside the residual of the forces).
+
+    Args:
+        particles: The body.
+        points: Its material.
+        moduli: Bulk and shear modulus of each of its points, undeformed.
+
+    Returns:
+        ``int ds : C^-1 : ds + 2/3 mu g^2 dX``, shape ``(n,)``.
+    """
+    stress, smooth = recovered(particles, points)
+    weights = points.strain.weights
     bulk, shear = (modulus.reshape(weights.shape) for modulus in moduli)
     change = smooth - stress
     mean = np.trace(change, axis1=2, axis2=3) / 3.0

@@ -24,6 +24,7 @@ from ..parallel.boundary import of_user
 from ..parallel.interruption import Hold, Interrupted, held, interrupted, settle
 from ..parallel.totals import over_ranks
 from ..system.errors import estimated
+from ..system.locking import locking
 from ..system.release import Release
 from .adaptivity import Adaptivity
 from .automatic import ErrorControl, error_of_step
@@ -65,7 +66,7 @@ class Stepper:
     def __init__(self, trial: Trial, release: Release, mender: Mender | None = None) -> None:
         self.trial, self._release, self._mender = trial, release, mender
         self.interrupted: Run | None = None
-        self._begins_stage = False
+        self._begins_stage = self._told_of_locking = False
 
     @property
     def share(self) -> float:
@@ -204,10 +205,13 @@ class Stepper:
         return trial.run
 
     def _doubts(self, run: Run) -> list[str]:
-        """Return warnings that a run that freed nodes ends with."""
-        if run.adaptivity is None or (found := self.trial.owner.history.steps[-1].error) is None:
-            return []
-        every = (run.adaptivity.complaint(found), run.doubt)
+        """Return warnings that a run ends with (collective)."""
+        owner, every = self.trial.owner, []
+        if owner.at_rest and not self._told_of_locking:
+            every.append(locking(owner.bodies, self.trial.solver.system.body_terms))
+            self._told_of_locking = every[0] is not None
+        if run.adaptivity is not None and (found := owner.history.steps[-1].error) is not None:
+            every += [run.adaptivity.complaint(found), run.doubt]
         return [sentence for sentence in every if sentence is not None]
 
     def _try(
