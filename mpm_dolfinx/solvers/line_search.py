@@ -229,7 +229,7 @@ class LineSearch:
 
     def _damp(self, step: _Step, start: PETSc.Vec, F: PETSc.Vec, trial: PETSc.Vec) -> None:
         """Damp the step, more and more, until domains bear it and norm or work fall far enough."""
-        for _ in self._steps.damped(start, step.y):
+        for _ in self._steps.damped(start, step.y, of_first=True):
             damped = _Step.of(step.x, step.y, start)
             if self._reduces(damped, F, trial):
                 break

@@ -277,13 +277,16 @@ class ShiftedFactor:
             self._choose(True)
             self.P = None
 
-    def set(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
+    def set(
+        self, K: PETSc.Mat, levels: Levels, damping: float = 0.0, of_first: bool = False
+    ) -> None:
         """Factorise K with the step's shift, or with a larger one (collective).
 
         Args:
             K: The tangent.
             levels: What multigrid must know of the unknowns.
             damping: Relative shift, if larger.
+            of_first: Whether that is relative to the step's first tangent, where it has a shift.
         """
         self._levels = levels
         if self.iterates and self._dear:
@@ -294,20 +297,26 @@ class ShiftedFactor:
             negative = int(np.count_nonzero(self.D.array_r < 0.0))
             self.num_negative = over_ranks(K.comm.tompi4py(), negative)
         self._negative = False
+        diagonal = None
+        if damping > self.shift:
+            if of_first and self.D is not None:
+                diagonal = damping / self.shift * self.D
+            else:
+                diagonal = damping * levels.diagonal(K)
         if self.iterates:
-            self._make_levels(K, levels, damping)
+            self._make_levels(K, levels, diagonal)
         else:
-            self._factorise(K, levels, damping)
+            self._factorise(K, levels, diagonal)
         self._statistics.count("factorisations")
         if self._unread:
             names = [key.removeprefix(self._prefix) for key in sorted(self._unread)]
             self._unread = set()
             warn_of_unread(K.comm.tompi4py(), names)
 
-    def _factorise(self, K: PETSc.Mat, levels: Levels, damping: float = 0.0) -> None:
-        """Make a factor of K with a shift (collective)."""
+    def _factorise(self, K: PETSc.Mat, levels: Levels, damping: PETSc.Vec | None = None) -> None:
+        """Make a factor of K with a shift, the step's or a larger one (collective)."""
         new = self.K is not K
-        diagonal = self._damping(K, levels, damping) if damping > self.shift else self.D
+        diagonal = self.D if damping is None else damping
         if diagonal is None:
             self.P = K
         elif new or self.P is K:
@@ -340,12 +349,6 @@ class ShiftedFactor:
                 self._ksp.setUp()  # where the factor is made, which reads options of its own
                 give_workspace(self._ksp, self.K, self.P, self._statistics)
 
-    def _damping(self, K: PETSc.Mat, levels: Levels, relative: float) -> PETSc.Vec:
-        """Return a diagonal in proportion to that of the solve's first tangent, or of K."""
-        if self.D is None:
-            return relative * levels.diagonal(K)
-        return relative / self.shift * self.D
-
     def _split(self, splits: Sequence[tuple[str, slice]]) -> None:
         """Tell a PC of type fieldsplit where the unknowns of each field are, by name (collective).
 
@@ -362,10 +365,10 @@ class ShiftedFactor:
         with options_refused(), self._own_options():
             pc.setFromOptions()
 
-    def _make_levels(self, K: PETSc.Mat, levels: Levels, damping: float) -> None:
+    def _make_levels(self, K: PETSc.Mat, levels: Levels, damping: PETSc.Vec | None) -> None:
         """Make the levels of multigrid for K, a copy of which is shifted where it must be."""
         known = self.K is K
-        damped = damping > self.shift
+        damped = damping is not None
         with self._statistics.phase("factorise"), self._own_options(), options_refused():
             if not known:
                 self._refining = self._flexible = self._shifted = None
@@ -380,8 +383,8 @@ class ShiftedFactor:
             assert self._multigrid is not None
             matrix = K if not damped and self._sweepable(K) else None
             if matrix is None:
-                relative = damping if damped else HALF_DIGITS
-                matrix = self._shifted_copy(K, self._damping(K, levels, relative))
+                diagonal = HALF_DIGITS * levels.diagonal(K) if damping is None else damping
+                matrix = self._shifted_copy(K, diagonal)
             if self._symmetric:
                 matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._ksp.setOperators(acting(matrix if damped else K), matrix)
@@ -467,7 +470,7 @@ class ShiftedFactor:
         if not done and self.P is K:
             self._singular = True
             self.forget()  # (what has failed is made anew)
-            self._make_levels(K, levels, 0.0)
+            self._make_levels(K, levels, None)
             done = self._iterate(b, x)
         if done:
             self._assess(self._ksp, b)

@@ -81,10 +81,10 @@ def failure_of(ksp: PETSc.KSP) -> Failure | None:
     reason, pc = ksp.getConvergedReason(), ksp.getPC().getType()
     if reason >= 0:
         return None
+    if reason == reasons.DIVERGED_PCSETUP_FAILED:
+        return Failure("as the factorisation of the tangent failed")
     if pc in FACTORS:
-        factorised = reason != reasons.DIVERGED_PCSETUP_FAILED
-        what = "a linear solve" if factorised else "the factorisation of the tangent"
-        return Failure(f"as {what} failed")
+        return Failure("as a linear solve failed")
     names = (name for name, value in vars(reasons).items() if value == reason)
     name = next(names, f"reason {reason}")
     return Failure(

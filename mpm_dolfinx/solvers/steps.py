@@ -47,10 +47,12 @@ class Steps:
         self.count = self.indefinite = 0
         self.refines, self.refined = False, SMALL
 
-    def follow(self, damping: float = 0.0, K: PETSc.Mat | None = None) -> None:
+    def follow(
+        self, damping: float = 0.0, K: PETSc.Mat | None = None, of_first: bool = False
+    ) -> None:
         """Factorise the tangent at the last residual, or a given one."""
         K = self._problem.tangent() if K is None else K
-        self._factor.set(K, self._problem.levels, damping)
+        self._factor.set(K, self._problem.levels, damping, of_first)
 
     def solve(self, b: PETSc.Vec, y: PETSc.Vec) -> None:
         """Solve with the last factor, and for the tangent itself where the shift matters."""
@@ -110,20 +112,22 @@ class Steps:
             return True
         self.indefinite += 1
         self._factor.give_up(self._shortens)
-        for _ in self.damped(R, y):
+        for _ in self.damped(R, y, of_first=False):
             if not self.uphill(R, y):
                 break
         return False
 
-    def damped(self, R: PETSc.Vec, y: PETSc.Vec) -> Iterator[None]:
+    def damped(self, R: PETSc.Vec, y: PETSc.Vec, of_first: bool) -> Iterator[None]:
         """Replace a step by those of the last tangent with more and more damping, one at a time.
 
         Args:
             R: The residual.
             y: The step.
+            of_first: Whether damping is relative to the first tangent, as where the last one has
+                lost what resisted.
         """
         for damping in DAMPINGS:
-            self.follow(damping, self._factor.K)
+            self.follow(damping, self._factor.K, of_first)
             self._factor.solve(R, y)
             self._negative = self._problem.constrain(y, self._origin, self._factor.solve)
             self.count += 1
