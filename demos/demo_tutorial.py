@@ -20,11 +20,11 @@ import mpm_dolfinx as mpm
 
 # The **background** is where the unknowns live. It never moves, and is large enough for the body to
 # flow into. The **body** is another mesh: each of its cells is the domain of a particle, which goes
-# where the background carries it. Here eight triangles lie in each cell of the background.
+# where the background carries it. Here four quadrilaterals lie in each cell of the background.
 
 comm, quadrilateral = MPI.COMM_WORLD, mesh.CellType.quadrilateral
 background = mesh.create_rectangle(comm, [[0, 0], [9, 5]], [36, 20], quadrilateral)
-body = mesh.create_rectangle(comm, [[0, 0], [2, 4]], [16, 32], mesh.CellType.triangle)
+body = mesh.create_rectangle(comm, [[0, 0], [2, 4]], [16, 32], quadrilateral)
 V = fem.functionspace(background, ("Lagrange", 1, (2,)))
 particles = mpm.Particles(body, V)
 
