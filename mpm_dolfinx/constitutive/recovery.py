@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dolfinx import la
 
+from ..errors import agree
 from ..particles.particles import Particles
 from .points import MaterialPoints
 
@@ -29,7 +30,8 @@ def recovered(particles: Particles, points: MaterialPoints) -> tuple[Array, Arra
         particles: The body.
         points: Its material.
     """
-    stress = points.last.gained_stress(particles.point_deformation_gradient)
+    with agree(particles.mesh.comm):  # (a law of the user's tells it)
+        stress = points.last.gained_stress(particles.point_deformation_gradient)
     stress = stress + np.broadcast_to(points.last.recovery, (len(stress), 3, 3))[:, None]
     weights = points.strain.weights
     at_nodes = _continued(particles, stress, weights)

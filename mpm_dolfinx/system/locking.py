@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..constitutive.points import MaterialPoints
 from ..constitutive.recovery import recovered
+from ..errors import agree
 from ..particles.particles import Particles
 from ..tolerances import SMALL
 from .body import BodyTerm
@@ -39,12 +40,15 @@ def locking(bodies: Sequence[Particles], terms: Sequence[BodyTerm]) -> str | Non
             continue
         if points.averaging is not None and points.averaging.kind == "patch":
             continue
+        comm = body.mesh.comm
+        with agree(comm):
+            whole = points.last.cauchy_stress()
         stress, smooth = recovered(body, points)
         weights = points.strain.weights * ~body.deleted[:, None]
-        every = (stress - smooth, stress, points.last.cauchy_stress())
+        every = (stress - smooth, stress, whole)
         sums = np.array([np.sum(weights * _squares(part), axis=(1, 2)) for part in every])
-        up_and_down, uneven, _, shear, *whole = np.sqrt(body.mesh.comm.allreduce(sums).ravel())
-        if up_and_down > max(0.5 * shear, 2.0 * uneven, SMALL * sum(whole)):
+        up_and_down, uneven, _, shear, *sizes = np.sqrt(comm.allreduce(sums).ravel())
+        if up_and_down > max(0.5 * shear, 2.0 * uneven, SMALL * sum(sizes)):
             found.append((f"body {number}", up_and_down / shear))
     if not found:
         return None
