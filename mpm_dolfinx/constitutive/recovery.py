@@ -13,9 +13,15 @@ from ..errors import agree
 from ..particles.particles import Particles
 from .points import MaterialPoints
 
-__all__ = ["recovered", "stress_errors"]
+__all__ = ["parts", "recovered", "stress_errors"]
 
 type Array = NDArray[np.float64]
+
+
+def parts(tensor: Array) -> tuple[Array, Array]:
+    """Return the mean of symmetric tensors ``(..., 3, 3)`` and the size of their deviator."""
+    mean = np.trace(tensor, axis1=-2, axis2=-1) / 3.0
+    return mean, np.linalg.norm(tensor - mean[..., None, None] * np.eye(3), axis=(-2, -1))
 
 
 def recovered(particles: Particles, points: MaterialPoints) -> tuple[Array, Array]:
@@ -63,10 +69,8 @@ def stress_errors(
     stress, smooth = recovered(particles, points)
     weights = points.strain.weights
     bulk, shear = (modulus.reshape(weights.shape) for modulus in moduli)
-    change = smooth - stress
-    mean = np.trace(change, axis1=2, axis2=3) / 3.0
-    deviator = change - mean[:, :, None, None] * np.eye(3)
-    energy = np.einsum("nqij,nqij->nq", deviator, deviator) / (2.0 * shear) + mean**2 / bulk
+    mean, deviator = parts(smooth - stress)
+    energy = deviator**2 / (2.0 * shear) + mean**2 / bulk
     if points.mean_stress is not None:
         energy += 2.0 / 3.0 * shear * points.mean_stress.gap.reshape(weights.shape) ** 2
     return np.asarray((weights * energy).sum(axis=1))
@@ -101,9 +105,10 @@ def _means(particles: Particles, values: Array, weights: Array) -> Array:
     layout, domains = particles.W.dofmap.index_map, particles.domain_nodes
     sums = la.vector(layout, 10)
     table = sums.array.reshape(-1, 10)
-    table[:] = 0.0
     rows = np.concatenate([values.reshape(*domains.shape, 9), np.ones((*domains.shape, 1))], axis=2)
-    np.add.at(table, domains, weights[:, None, None] * rows)
+    rows *= weights[:, None, None]
+    for column, own in zip(table.T, rows.reshape(-1, 10).T, strict=True):
+        column[:] = np.bincount(domains.ravel(), own, len(table))
     sums.scatter_reverse(la.InsertMode.add)
     sums.scatter_forward()
     known = np.where(table[:, 9:] > 0.0, table[:, 9:], 1.0)

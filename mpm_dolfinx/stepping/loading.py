@@ -154,8 +154,7 @@ class Stepper:
             trial.run = None
             if (sentence := left_outside(owner.bodies, owner.history)) is not None:
                 warn(comm, sentence)
-            for sentence in self._doubts(run):
-                warn(comm, sentence)
+            self._warn_of_doubts(run)
             if interrupted(comm, last.left):
                 self._leave()
         if hold.left:
@@ -204,15 +203,19 @@ class Stepper:
             trial.converged.parameter = 0.0 if trial.run.shares else trial.converged.load
         return trial.run
 
-    def _doubts(self, run: Run) -> list[str]:
-        """Return warnings that a run ends with (collective)."""
+    def _warn_of_doubts(self, run: Run | None) -> None:
+        """Warn at the end of a run, or of a single step, of what makes it doubtful (collective)."""
         owner, every = self.trial.owner, []
+        system = self.trial.solver.system
         if owner.at_rest and not self._told_of_locking:
-            every.append(locking(owner.bodies, self.trial.solver.system.body_terms))
+            every.append(locking(owner.bodies, system.body_terms))
             self._told_of_locking = every[0] is not None
-        if run.adaptivity is not None and (found := owner.history.steps[-1].error) is not None:
-            every += [run.adaptivity.complaint(found), run.doubt]
-        return [sentence for sentence in every if sentence is not None]
+        if run is not None and run.adaptivity is not None:
+            if (found := owner.history.steps[-1].error) is not None:
+                every += [run.adaptivity.complaint(found), run.doubt]
+        for sentence in every:
+            if sentence is not None:
+                warn(system.comm, sentence)
 
     def _try(
         self, run: Run, update: Path | None, control: DisplacementControl | None
@@ -402,6 +405,7 @@ class Stepper:
                     "displacements of supports are multiplied; if these were to act, set "
                     "particles.load.value before, or apply them by solve().",
                 )
+            self._warn_of_doubts(None)
             if interrupted(comm):
                 self._leave()
         if hold.left:

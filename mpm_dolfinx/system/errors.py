@@ -15,7 +15,7 @@ from dolfinx import fem
 from ..assembly.petsc import absolute
 from ..constitutive.moduli import bulk_and_shear_moduli
 from ..constitutive.points import MaterialPoints
-from ..constitutive.recovery import stress_errors
+from ..constitutive.recovery import parts, stress_errors
 from ..errors import MPMError
 from ..particles.particles import Particles
 from ..tolerances import SMALL, UNCERTAIN
@@ -147,14 +147,8 @@ def _sizes(
     squares, axes = np.linalg.eigh(F @ F.swapaxes(-1, -2))
     strain = np.einsum("nqik,nqk,nqjk->nqij", axes, 0.5 * np.log(squares), axes)
     stress = np.linalg.det(F)[..., None, None] * points.last.gained_stress(F)
-    (p, s), (v, e) = (_parts(tensor) for tensor in (stress, strain))
+    (p, s), (v, e) = (parts(tensor) for tensor in (stress, strain))
     elastic = s / (2.0 * shear.reshape(s.shape))
     flows = points.last.plastic_strain() > 0.0
     densities = np.array([3.0 * np.abs(p * v) + s * e, s * e, flows * s * (e - elastic)])
     return np.asarray((points.strain.weights * densities)[:, ~body.deleted].sum(axis=(1, 2)))
-
-
-def _parts(tensor: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean of symmetric tensors ``(..., 3, 3)`` and the size of their deviator."""
-    mean = np.trace(tensor, axis1=-2, axis2=-1) / 3.0
-    return mean, np.linalg.norm(tensor - mean[..., None, None] * np.eye(3), axis=(-2, -1))

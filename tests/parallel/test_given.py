@@ -156,6 +156,15 @@ def test_law_that_fails_on_one_rank(method, f_bar, mpi_tmp_path):
     fails(run, rf"{method} of Failing failed with ValueError: no table")
 
 
+def test_an_error_asked_of_a_law_that_fails_on_one_rank():
+    def run():
+        problem = made(Failing("cauchy_stress"), f_bar="patch")
+        problem.solve(steps=1)
+        problem.error()
+
+    fails(run, "cauchy_stress of Failing failed with ValueError: no table")
+
+
 def test_support_whose_law_fails_on_one_rank():
     V = scenes.vectors(scenes.box([0.0, -1.0], [2.0, 2.0], [4, 6], QUADRILATERAL))
     p = mpm.Particles(scenes.unit(2, QUADRILATERAL), V, quadrature_degree=2)

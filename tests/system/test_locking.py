@@ -48,6 +48,27 @@ def test_clay_that_locks_is_told_once_and_too_strong(cell):
     assert all("f_bar='patch'" in text for text in told)
 
 
+def test_a_cut_that_locks_as_its_strength_is_reduced_is_told():
+    # By defaults clay bears its weight without yielding, and then several times what it can.
+    V = vectors(box([0, 0], [4, 2.5], [16, 10], QUADRILATERAL))
+    law = materials.Tresca(1e5, 0.3, cohesion=20.0)
+    held = [mpm.held(V, 0, x=0.0), mpm.held(V, y=0.0)]
+    factors = {}
+    for f_bar in ("patch", "none"):
+        clay = mpm.Particles(box([0, 0], [3, 2], [24, 16], QUADRILATERAL), V)
+        body = mpm.Body(clay, law, density=2.0, body_force=(0.0, -10.0), f_bar=f_bar)
+        problem = mpm.QuasiStaticProblem(body, bcs=held)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            problem.solve(1)
+            before = [one for one in caught if TOLD in str(one.message)]
+            factors[f_bar] = mpm.strength_reduction(problem, tolerance=0.2, most=8.0).factor
+        told = [one for one in caught if TOLD in str(one.message)]
+        assert before == []
+        assert len(told) == (1 if f_bar == "none" and WORLD.rank == 0 else 0)
+    assert factors["none"] > 1.5 * factors["patch"]
+
+
 def test_an_average_over_a_domain_does_not_cure_four_domains_in_a_cell():
     *_, told = pressed(CLAY, points=2, f_bar="domain")
     assert len(told) == (1 if WORLD.rank == 0 else 0)
