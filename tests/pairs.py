@@ -197,6 +197,7 @@ def fail_after(count, **options):
     before = [{k: c.values.copy() for k, c in touch.columns(i).items()} for i in (0, 1)]
     force, d = problem.reaction(touch), [b.displacement.x.array.copy() for b in problem.bodies]
     problem.bcs[0].g.value[:] = [0.0, -0.9]
+    problem.solver.setTolerances(max_it=3)
     with pytest.raises(mpm.MPMError):
         problem.step()
     assert np.array_equal(force, problem.reaction(touch))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import EXACT, error_of_a_term, outcome, same_run
-from marks import thinned
+from marks import slow, thinned
 from obstacles import on_plane
 from pairs import POISSON, YOUNG, balance, fail_after, go_on_other_meshes, hertz, patch, spaces, two
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, WORLD
@@ -205,14 +205,14 @@ def test_a_step_that_fails_leaves_everything_as_it_was():
 
 def test_a_checkpoint_goes_on_as_the_run_does(mpi_tmp_path):
     problem, touch, path = two()
-    for _ in problem.steps(8, update=path):
-        if len(problem.history.steps) == 5:
+    for _ in problem.steps(6, update=path):
+        if len(problem.history.steps) == 4:
             problem.save(mpi_tmp_path / "half.ckpt")
             force = problem.reaction(touch)
     other, again, path = two()
     other.restore(mpi_tmp_path / "half.ckpt")
     assert np.abs(other.reaction(again) - force).max() < 1e-9 * np.abs(force).max()
-    other.solve(8, update=path)
+    other.solve(6, update=path)
     end = problem.reaction(touch)
     assert np.abs(other.reaction(again) - end).max() < 1e-7 * np.abs(end).max()
     same_run(outcome(other), outcome(problem), EXACT)
@@ -227,22 +227,22 @@ def test_contact_follows_other_meshes_of_the_bodies(what):
 def test_a_pair_of_a_body_that_is_split_goes_on_from_a_checkpoint(mpi_tmp_path):
     cells = (QUADRILATERAL, QUADRILATERAL)
     problem, touch, path = two(cells)
-    for number, _ in enumerate(problem.steps(8, update=path)):
-        if number == 4:
+    for number, _ in enumerate(problem.steps(6, update=path)):
+        if number == 3:
             before = problem.reaction(touch)
             problem.split(np.arange(0, problem.bodies[1].num_global, 3), body=1)
             assert np.abs(problem.reaction(touch) - before).max() < 1e-8 * np.abs(before).max()
-        if number == 5:
+        if number == 4:
             problem.save(mpi_tmp_path / "split")
     other, again, path = two(cells)
     other.restore(mpi_tmp_path / "split")
-    other.solve(8, update=path)
+    other.solve(6, update=path)
     end = problem.reaction(touch)
     assert np.abs(other.reaction(again) - end).max() < 1e-9 * np.abs(end).max()
     same_run(outcome(other), outcome(problem), EXACT)
 
 
-@pytest.mark.parametrize("passes", [1, 2])
+@pytest.mark.parametrize("passes", [*slow(1), 2])
 def test_a_pair_of_a_body_that_has_lost_domains_is_that_of_a_shorter_body(passes):
     # Nothing depends on the past here: elastic bodies without friction.
     found = []

@@ -228,7 +228,7 @@ def test_an_equal_contact_in_its_place_changes_nothing(kind):
         forces = old.reaction
         problem.stage(terms=[new])
         np.testing.assert_allclose(new.reaction, forces, rtol=0.0, atol=1e-12 * 30.0)
-        problem.solve(3, update=lambda t, new=new, move=move: move(new, t))
+        problem.solve(2, update=lambda t, new=new, move=move: move(new, t))
         x = scenes.in_order(problem.particles, problem.particles.centroid)
         found.append((x, problem.reaction(new)))
         sticks = (new.contacts[0] if " " in kind else new).sticks
@@ -249,14 +249,14 @@ def test_an_equal_pair_in_its_place_changes_nothing(law, passes, swapped):
     for replaced in (False, True):
         problem, old, path = pairs.two(friction=0.3, law=law, passes=passes)
         problem.solver.setTolerances(rtol=1e-13)
-        problem.solve(3, update=lambda t, path=path: path(0.5 * t))
+        problem.solve(2, update=lambda t, path=path: path(0.5 * t))
         a, b = problem.bodies[::-1] if swapped else problem.bodies
         new = contact.Pair(a, b, 0.3, law=law, passes=passes) if replaced else old
         force = old.reaction
         problem.stage(terms=[new])
         sign = -1.0 if replaced and swapped else 1.0
         np.testing.assert_allclose(sign * new.reaction, force, rtol=0.0, atol=1e-12 * 30.0)
-        problem.solve(2, update=lambda t, path=path: path(0.5 + 0.1 * t))
+        problem.solve(1, update=lambda t, path=path: path(0.5 + 0.1 * t))
         places = [scenes.in_order(body, body.centroid) for body in problem.bodies]
         found.append((np.concatenate(places), sign * problem.reaction(new)))
     for one, two in zip(*found, strict=True):
@@ -322,14 +322,14 @@ def test_equals_of_two_pairs_in_their_places_change_nothing(law):
 
         old = of_sides()
         problem.stage(terms=old)
-        problem.solve(3, update=lambda t, path=path: path(0.5 * t))
+        problem.solve(2, update=lambda t, path=path: path(0.5 * t))
         new = of_sides() if replaced else old
         forces = np.array([one.reaction for one in old])
         assert np.abs(forces[:, 1]).min() > 1.0
         problem.stage(terms=new)
         now = [one.reaction for one in new]
         np.testing.assert_allclose(now, forces, rtol=0.0, atol=1e-12 * 30.0)
-        problem.solve(2, update=lambda t, path=path: path(0.5 + 0.1 * t))
+        problem.solve(1, update=lambda t, path=path: path(0.5 + 0.1 * t))
         places = [scenes.in_order(body, body.centroid) for body in problem.bodies]
         found.append((np.concatenate(places), np.array([problem.reaction(one) for one in new])))
     for one, two in zip(*found, strict=True):

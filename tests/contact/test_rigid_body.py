@@ -87,7 +87,7 @@ def test_an_impact_keeps_energy_momentum_and_angular_momentum(shape, friction):
     assert np.mean(problem.history.iterations) < 5.0 and problem.history.cutbacks == 0
 
 
-@pytest.mark.parametrize("strength", [4.0, 50.0])
+@pytest.mark.parametrize("strength", [4.0, *slow(50.0)])
 def test_an_impact_on_metal_takes_what_yielding_takes(strength):
     # The work of a radial return, found from the plastic strains: nothing is won or lost besides,
     # neither where metal yields nor where it is struck too softly for that.
@@ -108,7 +108,7 @@ def test_an_impact_at_the_coordinates_of_a_map_takes_the_same_steps(shape):
     found = []
     for origin in (0.0, 4e6):
         problem, ball = thrown(shape, 0.4, origin=origin, petsc_options={"snes_rtol": 1e-8})
-        problem.solve(time=0.24, dt=0.02)
+        problem.solve(time=0.16, dt=0.02)
         assert problem.history.cutbacks == 0
         found.append(np.concatenate([ball.offset, ball.velocity]))
     # (points touch at a gap of 1e-12 of the coordinates)
@@ -122,8 +122,8 @@ def test_a_body_falls_and_spins_as_nothing_touches_it():
     )
     J = np.diag([1.0, 2.0, 3.0])
     start = np.array([0.3, 2.0, 0.2])  # near to the axis about which it cannot spin for long
-    found = []
-    for dt in (0.1, 0.05):
+    found, end = [], 1.6
+    for dt in (0.16, 0.08):
         stone = contact.RigidBody(
             particles,
             contact.box((3.0, 3.0, 3.0), (4.0, 4.5, 5.0), 0.1),
@@ -137,7 +137,7 @@ def test_a_body_falls_and_spins_as_nothing_touches_it():
             mpm.Body(particles, Hencky(1e3, 0.3), density=1.0), terms=[stone]
         )
         momentum, kinetic = J @ start, 0.5 * start @ J @ start
-        for _ in problem.steps(time=2.0, dt=dt):
+        for _ in problem.steps(time=end, dt=dt):
             t = problem.history.time
             place = t * np.array([1.0, 0.0, 2.0]) + 0.5 * t**2 * np.array([0.0, 1.0, -10.0])
             assert np.abs(stone.offset - place).max() < 1e-12 * (1.0 + 5.0 * t**2)
@@ -148,7 +148,8 @@ def test_a_body_falls_and_spins_as_nothing_touches_it():
         found.append(stone.placed().distance)
         angle = stone.angle
     # Euler's equations by Runge and Kutta.
-    w, Q, n = start.copy(), np.eye(3), 200
+    w, Q, n = start.copy(), np.eye(3), 160
+    h = end / n
 
     def rates(w, Q):
         W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
@@ -157,9 +158,9 @@ def test_a_body_falls_and_spins_as_nothing_touches_it():
     for _ in range(n):
         k = [rates(w, Q)]
         for c in (0.5, 0.5, 1.0):
-            k.append(rates(w + c * 2.0 / n * k[-1][0], Q + c * 2.0 / n * k[-1][1]))
+            k.append(rates(w + c * h * k[-1][0], Q + c * h * k[-1][1]))
         w, Q = (
-            y + 2.0 / 6.0 / n * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i])
+            y + h / 6.0 * (k[0][i] + 2 * k[1][i] + 2 * k[2][i] + k[3][i])
             for i, y in enumerate((w, Q))
         )
     centre = np.array([3.5, 3.75, 4.0])
@@ -460,10 +461,10 @@ def test_a_drop_weight_on_a_column_of_revolution():
         **TIGHT,
     )
     whole, before = weight.kinetic_energy, weight.momentum
-    for _ in problem.steps(time=0.2, dt=0.01):
+    for _ in problem.steps(time=0.2, dt=0.02):
         assert energy(problem, weight) == pytest.approx(whole, rel=1e-10)
         force = problem.reaction(weight)[1]
-        assert weight.momentum[1] - before[1] == pytest.approx(-0.01 * force, abs=1e-13)
+        assert weight.momentum[1] - before[1] == pytest.approx(-0.02 * force, abs=1e-13)
         assert weight.angle[0] == weight.offset[0] == 0.0
         before = weight.momentum
     assert weight.velocity[1] > -0.7

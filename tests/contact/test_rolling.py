@@ -72,7 +72,7 @@ def rolled(dim, friction, n, cell, dt, steps, scheme="euler", rests=False):
 
 
 def test_a_cylinder_rolls_with_two_thirds_of_the_acceleration():
-    found, _ = rolled(2, 0.5, 12, 0.125, 0.01, 60)
+    found, _ = rolled(2, 0.5, 10, 0.16, 0.015, 30)
     assert found == pytest.approx(2 / 3 * GRAVITY * np.sin(ANGLE), rel=0.03)
 
 

@@ -300,7 +300,7 @@ def dragged(shape, comm=WORLD, friction=0.4):
     def path(t):
         die.move((0.5 * max(t - 0.3, 0.0), -0.1 * min(t, 0.3) / 0.3), -0.5 * max(t - 0.5, 0.0))
 
-    problem.solve(10, update=path)
+    problem.solve(5, update=path)
     return problem, die
 
 

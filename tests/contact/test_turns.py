@@ -25,7 +25,7 @@ def pressed(friction=0.3):
     return problem, disc
 
 
-@pytest.mark.parametrize("turn", [1.0, 4.0, 2.0 * np.pi])
+@pytest.mark.parametrize("turn", [1.0, *slow(4.0), 2.0 * np.pi])
 def test_friction_is_against_the_turn_however_far_a_step_goes(turn):
     problem, disc = pressed()
     problem.solve(1, update=lambda t: disc.move((0.0, -0.05), turn * t))
@@ -76,6 +76,6 @@ def test_a_body_that_spins_fast_turns_as_far_as_it_should(scheme):
     problem = mpm.DynamicProblem(
         mpm.Body(body, Hencky(1e3, 0.3), density=1.0), scheme=scheme, terms=[disc]
     )
-    problem.solve(time=0.2, dt=0.1)
-    assert disc.angle == pytest.approx(10.0, rel=0.02) and disc.spin == pytest.approx(50.0)
+    problem.solve(time=0.1, dt=0.1)
+    assert disc.angle == pytest.approx(5.0, rel=0.02) and disc.spin == pytest.approx(50.0)
     assert problem.history.cutbacks > 0
