@@ -15,6 +15,7 @@ from ..background.basis import BackgroundBasis, PointBasis
 from ..errors import ParticleOutsideError, agree
 from ..transfer.method import CornerBasis, DomainState, Method, ParticleState
 from ..transfer.methods import METHODS
+from ..transfer.owned import OwnedRows
 from ..transfer.transfer import Transfer
 from .deletion import Deletion
 from .free import FreeNodes
@@ -75,6 +76,7 @@ class Placement:
         self.deletion, self.free_nodes = deletion, free_nodes
         self.displacement = np.zeros_like(self._geometry.nodes)
         self._transfer: Transfer | None = None
+        self._owned: OwnedRows | None = None
 
     # -- Places ---------------------------------------------------------------------------
 
@@ -154,9 +156,19 @@ class Placement:
     def _rows(self) -> CornerBasis:
         """Return the rows of T, zero for free nodes (collective)."""
         rows = self._mover.method.rows(self._state(), self._mover.basis)
+        self._share(rows.basis)
         if self.free_nodes is not None:
             self.free_nodes.take(rows.basis)
         return rows
+
+    def _share(self, rows: PointBasis) -> None:
+        """Give nodes that several ranks know the rows of their owners, in place (collective)."""
+        method, W = self._mover.method, self._geometry.W
+        if W.mesh.comm.size == 1 or not method.shares_nodes or method.free:
+            return
+        if self._owned is None:
+            self._owned = OwnedRows(W, rows.nodes.shape[1])
+        self._owned.share(rows)
 
     def _lost(self, rows: CornerBasis) -> NDArray[np.int64]:
         """Return the local domains that are not wholly in the background."""
@@ -216,6 +228,7 @@ class Placement:
         for known, other in zip(whole.basis, rows, strict=True):
             if known is not None and other is not None:
                 known[nodes] = other
+        self._share(whole.basis)
         self._take(whole)
 
     def basis_with_gradients(self) -> PointBasis:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scenes
 from compare import outcome, same_run
-from scenes import PLANE, QUADRILATERAL, TRIANGLE, WORLD, A, B
+from scenes import HEXAHEDRON, PLANE, QUADRILATERAL, TRIANGLE, WORLD, A, B
 
 from dolfinx import mesh
 
@@ -140,6 +140,19 @@ def test_particles_far_from_the_rank_of_their_background():
 
     arrays = compare(make, 5)
     assert arrays["plastic_strain 0"].max() > 0.0
+
+
+def test_nodes_that_a_stiff_support_lets_go_1e_12_behind_a_facet():
+    def make(comm):
+        V = scenes.vectors(scenes.box([-0.5] * 3, [1.5] * 3, [4] * 3, HEXAHEDRON, comm))
+        body = mpm.Particles(scenes.unit(4, HEXAHEDRON, comm), V)
+        tags = scenes.facet_tags(body.mesh, scenes.at(2, 0.0))
+        return mpm.QuasiStaticProblem(
+            mpm.Body(body, Hencky(1e3, 0.3), density=1.0, body_force=(10.0, 0.0, 0.0)),
+            supports=[mpm.boundary.fixed(body, tags, 1)],
+        )
+
+    compare(make, 2)
 
 
 def test_statistics_count_the_same_on_all_ranks():

@@ -77,6 +77,19 @@ def test_what_acts_for_T_multiplies_as_it_does(background, cell):
     np.testing.assert_allclose(u.array_r, total.array_r, atol=1e-14)
 
 
+@pytest.mark.mpi
+@pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID], ids=scenes.name)
+def test_ranks_move_nodes_that_they_share_by_the_same_weights(background, cell):
+    # Bit by bit, as those of a node beside a facet are no larger than round-off of its position.
+    particles = scene(background, cell)
+    rows, layout = particles.node_basis, particles.W.dofmap.index_map
+    numbers = layout.local_to_global(np.arange(len(rows.nodes), dtype=np.int32))
+    weights = np.column_stack([rows.nodes, rows.values, rows.found])
+    owned = scenes.gather(weights[: layout.size_local])
+    np.testing.assert_array_equal(weights, owned[numbers])
+    assert scenes.WORLD.allreduce(layout.num_ghosts) > 0
+
+
 @pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID], ids=scenes.name)
 def test_active_dofs_are_the_columns_of_T(background, cell):
     particles = scene(background, cell)
