@@ -17,6 +17,7 @@ from dolfinx import fem, mesh
 from .. import _compat
 from ..background.basis import BackgroundBasis, PointBasis
 from ..errors import MPMError, ParticleOutsideError, agree
+from ..meshes.nodes import node_positions
 from ..meshes.quadrature import quadrature_rule
 from ..parallel.boundary import collective
 from ..parallel.compilation import compiled_expression
@@ -296,14 +297,14 @@ class CarriedField:
             points = _undeformed_points(body) if self.is_frozen else body.placement.points()
             return points.reshape(-1, gdim)
         if self.is_frozen:
-            x = self.W.tabulate_dof_coordinates()[:, :gdim]
+            x = node_positions(self.W)
         else:
             x = self.converged_nodes()
         return np.asarray(x[: self.W.dofmap.index_map.size_local])
 
     def converged_nodes(self) -> NDArray[np.float64]:
         """Return the positions of a field's nodes, last converged, ``(N, gdim)`` (collective)."""
-        x = self.W.tabulate_dof_coordinates()[:, : self.mesh.geometry.dim]
+        x = node_positions(self.W)
         return np.asarray(x + self._at_nodes(self.field.particles.converged_displacement))
 
     def _at_nodes(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from .. import _compat
 from ..errors import DomainDistortionError, agree
 from ..meshes.cells import equispaced_element, input_cell_index
 from ..meshes.jacobian_bound import JacobianBound, jacobians
+from ..meshes.nodes import node_positions
 from ..meshes.order import vtk_cell
 from ..meshes.quadrature import (
     DomainQuadrature,
@@ -77,7 +78,7 @@ class Geometry:
         self.num_global = int(cells.size_global)
         self.global_index = input_cell_index(body)
         self.domain_nodes: NDArray[np.int32] = self.W.dofmap.list[: self.num_local]
-        self.nodes: NDArray[np.float64] = self.W.tabulate_dof_coordinates()[:, : self.gdim].copy()
+        self.nodes: NDArray[np.float64] = node_positions(self.W)
 
     # -- Rules ----------------------------------------------------------------------------
 

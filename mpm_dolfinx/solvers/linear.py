@@ -160,7 +160,8 @@ class ShiftedFactor:
         """Put the options into PETSc's database, for what reads them inside the block."""
         database = PETSc.Options()
         saddle, compresses = self.num_negative > 0, self._compresses(size)
-        chosen = mumps_options(self._strategy, size, saddle, compresses)
+        ranks = self._ksp.comm.size
+        chosen = mumps_options(self._strategy, size, saddle, compresses, ranks)
         defaults = {self._prefix + k: v for k, v in chosen.items()}
         options = {k: v for k, v in defaults.items() if not database.hasName(k)} | self._options
         for key, value in options.items():

@@ -60,7 +60,9 @@ STRATEGIES = {
 }
 
 
-def mumps_options(strategy: Strategy, size: int, saddle: bool, compressed: bool) -> dict[str, Any]:
+def mumps_options(
+    strategy: Strategy, size: int, saddle: bool, compressed: bool, ranks: int
+) -> dict[str, Any]:
     """Return the options of MUMPS unless others are given.
 
     Args:
@@ -69,11 +71,10 @@ def mumps_options(strategy: Strategy, size: int, saddle: bool, compressed: bool)
         saddle: Whether the diagonal says nothing of the size of a row: rows and columns are scaled
             in turn then, else by the diagonal, as the shift is.
         compressed: Whether factors have blocks of low rank.
+        ranks: How many ranks have rows. Of several MUMPS scales in turn or not at all.
     """
-    if saddle:
-        options = {"mat_mumps_icntl_8": 7}
-    else:
-        options = {"mat_mumps_icntl_8": 1, "mg_coarse_mat_mumps_icntl_8": 1}
+    scaling = 7 if saddle or ranks > 1 else 1
+    options = {"mat_mumps_icntl_8": scaling, "mg_coarse_mat_mumps_icntl_8": scaling}
     if strategy.ordered is not None and size >= strategy.ordered:
         options["mat_mumps_icntl_7"] = 4
     return {**options, **(LOW_RANK if compressed else {})}

@@ -16,10 +16,10 @@ __all__ = ["OwnedRows"]
 class OwnedRows:
     """Gives nodes that several ranks know the rows of the rank that owns them.
 
-    Ranks compute the position of a node from different cells, and that differs by round-off. So does
-    a weight; of a node that lies 1e-12 of a cell behind a facet, as on a stiff support, in the
-    fifth digit. Domains of two ranks would follow the background by different T, and no tangent of
-    theirs is that of the forces.
+    What ranks find by themselves differs by round-off, as they know different parts of the
+    background. Of a node 1e-12 of a cell behind a facet, as on a stiff support, that is the fifth
+    digit of a weight. Domains of two ranks would follow the background by different T, and the sum
+    of their tangents would be that of no forces.
 
     Args:
         W: Space of the domains (collective).

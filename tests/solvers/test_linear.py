@@ -294,6 +294,14 @@ def test_few_unknowns_are_factorised_by_petsc_with_the_same_result(monkeypatch):
         assert scenes.largest(moved[0] - other) < 1e-6
 
 
+def test_rows_are_scaled_on_any_number_of_ranks():
+    # MUMPS leaves out what it cannot do, and tells what it has done.
+    problem = scenes.block(petsc_options={"mat_mumps_icntl_14": 30})
+    problem.solve(steps=1)
+    factor = problem.solver.getKSP().getPC().getFactorMatrix()
+    assert factor.getMumpsInfog(33) == factor.getMumpsIcntl(8) > 0
+
+
 def test_what_options_say_of_the_factor_holds_for_few_unknowns_too():
     problem = scenes.block(petsc_options={"mat_mumps_icntl_14": 30})
     problem.solve(steps=1)

@@ -86,8 +86,8 @@ def test_ranks_move_nodes_that_they_share_by_the_same_weights(background, cell):
     numbers = layout.local_to_global(np.arange(len(rows.nodes), dtype=np.int32))
     weights = np.column_stack([rows.nodes, rows.values, rows.found])
     owned = scenes.gather(weights[: layout.size_local])
-    np.testing.assert_array_equal(weights, owned[numbers])
     assert scenes.WORLD.allreduce(layout.num_ghosts) > 0
+    assert scenes.WORLD.allreduce(np.count_nonzero(weights != owned[numbers])) == 0
 
 
 @pytest.mark.parametrize(("background", "cell"), [*PAIRS, *SOLID], ids=scenes.name)
