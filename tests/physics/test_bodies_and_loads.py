@@ -165,7 +165,7 @@ def test_two_half_columns_are_one_column(case, material):
             bcs=bcs,
             petsc_options={"snes_rtol": 1e-11},
         )
-        problem.solve(steps=20)
+        problem.solve(steps=10)
         centres = scenes.gather(np.concatenate([b.initial_centroid for b in bodies]))
         order = np.lexsort(centres.round(6).T)
         runs.append(scenes.gather(np.concatenate([b.stress for b in bodies]))[order])

@@ -107,10 +107,10 @@ def test_a_free_body_flies_on(scheme, out, degree):
     momentum, turning, energy = problem.momentum, problem.angular_momentum, problem.kinetic_energy
     np.testing.assert_allclose(momentum, [0.6, -0.4], rtol=1e-13)
     np.testing.assert_allclose(turning, 1.73 * -0.4 - 2.01 * 0.6, rtol=1e-13)
-    history = problem.solve(time=2.0, dt=0.1)
+    history = problem.solve(time=1.0, dt=0.1)
     most = 0 if out == "project" and scheme != "euler" and degree == 1 else 1
     assert all(step.iterations <= most for step in history.steps)
-    moved = nodal(problem.particles.displacement) - [0.6, -0.4]
+    moved = nodal(problem.particles.displacement) - [0.3, -0.2]
     assert largest(moved) < 1e-10
     np.testing.assert_allclose(problem.momentum, momentum, atol=1e-11)
     np.testing.assert_allclose(problem.angular_momentum, turning, atol=1e-10)
@@ -189,10 +189,13 @@ def test_a_spinning_body_keeps_momentum_and_its_account(scheme, out):
     ("law", "route", "cell", "f_bar"),
     [
         (Hencky(100.0, 0.49), "loops", QUADRILATERAL, "domain"),
-        (Hencky(100.0, 0.49), "loops", TRIANGLE, "patch"),
-        (Hencky(100.0, 0.49), "reference", QUADRILATERAL, "domain"),
-        pytest.param(
-            *(Hencky(100.0, 0.49), "reference", TRIANGLE, "patch"), marks=pytest.mark.slow
+        *thinned(
+            3,
+            [
+                (Hencky(100.0, 0.49), "reference", QUADRILATERAL, "domain"),
+                (Hencky(100.0, 0.49), "reference", TRIANGLE, "patch"),
+                (Hencky(100.0, 0.49), "loops", TRIANGLE, "patch"),
+            ],
         ),
         (VonMises(100.0, 0.49, rho_y=99.0), "loops", TRIANGLE, "patch"),
     ],
@@ -255,7 +258,7 @@ def test_with_a_stabilised_pressure_no_energy_is_won(scheme, time):
     assert change_of_balance(history) < 1e-12
 
 
-@pytest.mark.parametrize("cell", [TRIANGLE, QUADRILATERAL])
+@pytest.mark.parametrize("cell", [*slow(TRIANGLE), QUADRILATERAL])
 def test_a_body_that_yields_keeps_its_angular_momentum(cell):
     # Bounds of the prototype: 1e-10, at most 5 solves in a step and no cutback.
     law = VonMises(100.0, 0.3, rho_y=0.2)
@@ -464,10 +467,10 @@ def test_a_bar_bounces_off_a_plane(scheme, out):
         mpm.Body(particles, LinearElastic(1.0, 0.0), density=1.0, velocity=(-0.1, 0.0)),
         scheme=scheme,
         out_of_range=out,
-        terms=[wall(particles, (0.2, 0.0), (1.0, 0.0))],
+        terms=[wall(particles, (0.29, 0.0), (1.0, 0.0))],
     )
     momentum = problem.momentum
-    history = problem.solve(time=3.6, dt=0.04)
+    history = problem.solve(time=2.8, dt=0.04)
     np.testing.assert_allclose(problem.momentum / momentum[0], [-1.0, 0.0], atol=0.06)
     whole = np.array([energy.kinetic + energy.internal for energy in history.energies])
     assert whole.max() <= whole[0] * (1.0 + 1e-9)
@@ -1106,11 +1109,11 @@ def test_two_fields_fly_apart_as_if_each_were_alone():
     alone = []
     for speed in (0.4, -0.3):
         problem = spinning(velocity=lambda x, s=speed: s * spin(x))
-        problem.solve(time=0.5, dt=0.05)
+        problem.solve(time=0.25, dt=0.05)
         alone.append(run_of(problem))
     pair = [square(), square()]
     together = spinning(pair, velocity=[lambda x, s=s: s * spin(x) for s in (0.4, -0.3)])
-    together.solve(time=0.5, dt=0.05)
+    together.solve(time=0.25, dt=0.05)
     found = run_of(together)
     for number, own in enumerate(alone):
         for name in ("positions", "stress", "velocity"):
@@ -1514,7 +1517,7 @@ def elastic(particles, young=100.0, poisson=0.3):
 def test_a_residual_in_ufl_moves_as_its_material(scheme, out, tmp_path):
     def both(kind):
         particles = square()
-        floor = wall(particles, (0.0, 1.45), (0.0, 1.0), modulus=100.0)
+        floor = wall(particles, (0.0, 1.48), (0.0, 1.0), modulus=100.0)
         options = {
             "velocity": lambda x: 0.2 * spin(x),
             "scheme": scheme,
@@ -1542,8 +1545,8 @@ def test_a_residual_in_ufl_moves_as_its_material(scheme, out, tmp_path):
     for kind in ("material", "UFL"):
         problem = both(kind)
         momentum = problem.momentum
-        for _ in problem.steps(time=0.6, dt=0.03):
-            if kind == "UFL" and len(problem.history.steps) == 10:
+        for _ in problem.steps(time=0.36, dt=0.03):
+            if kind == "UFL" and len(problem.history.steps) == 8:
                 problem.save(WORLD.bcast(tmp_path) / "run.ckpt")
         assert change_of_balance(problem.history) < 1e-11
         runs.append((problem, momentum))
@@ -1560,7 +1563,7 @@ def test_a_residual_in_ufl_moves_as_its_material(scheme, out, tmp_path):
     assert ends[0].internal > ends[0].strain > 0.0  # the floor has a share
     again = both("UFL")
     again.restore(WORLD.bcast(tmp_path) / "run.ckpt")
-    again.solve(time=0.6, dt=0.03)
+    again.solve(time=0.36, dt=0.03)
     assert largest(nodal(again.particles.displacement) - e) == 0.0
 
 
