@@ -10,9 +10,11 @@ import pytest
 MOST = 3
 #: Steps that are taken back, on all ranks: how, depends on no term or law.
 FAILURES = re.compile("ends_on|fail|interrupt|signal")
+#: Files: what is kept goes to all of them as columns, whatever it is.
+FILES = re.compile("checkpoint|restart|restore")
 #: What ranks do together besides solving: files, failures, other meshes, features with each other.
 TOGETHER = (
-    re.compile("checkpoint|restart|restore"),
+    FILES,
     FAILURES,
     re.compile("mesh|repartition|split"),
     re.compile("combination|feature|scene"),
@@ -23,12 +25,12 @@ REFUSALS = re.compile("refuse|no_sense|what_cannot_be|not_go_together")
 APART = re.compile("differ|fail|refuse|one_rank|out_of_range")
 #: Whole runs, whose answers one rank has looked at: what these are made of has tests of its own.
 WHOLE_RUNS = re.compile(
-    r"tests/(boundary|constitutive|contact|gradients|plot|problems|solvers|stabilisation|stepping|"
+    r"tests/(boundary|constitutive|gradients|plot|problems|solvers|stabilisation|stepping|"
     r"structures|system)/|/test_sections\.py"
 )
-#: Physics, texts that are read, arrays that each rank has for itself.
+#: Physics and contact, texts that are read, arrays that each rank has for itself.
 ALONE = re.compile(
-    r"tests/(benchmarks|demos|docs|materials|physics|stress)/|tests/test_|"
+    r"tests/(benchmarks|contact|demos|docs|materials|physics|stress)/|tests/test_|"
     r"/test_(jacobian_bound|law|nearest|order|quadrature|shapes)\.py"
 )
 
@@ -66,8 +68,9 @@ def between_ranks(items, ranks):
     - one set of parameters of each other function, which is no refusal: a ghost, a boundary between
       parts or a collective call does not know Poisson's ratio,
     - of a file of whole runs only a function about ranks, or the first where there is none, and the
-      first about each thing that ranks do together; of physics, and of what a rank does for itself,
-      only the latter; of steps that fail and are taken back one in a folder.
+      first about each thing that ranks do together; of physics, of contact, and of what a rank does
+      for itself, only the latter; of files, and of steps that fail and are taken back, one in a
+      folder.
 
     Args:
         items: The tests.
@@ -86,7 +89,7 @@ def between_ranks(items, ranks):
             continue
         folder = path.rpartition("/")[0]
         things = {
-            (folder if thing is FAILURES else path, thing)
+            (folder if thing in (FILES, FAILURES) else path, thing)
             for thing in TOGETHER
             if thing.search(name)
         }

@@ -318,7 +318,7 @@ def test_results_do_not_depend_on_the_ranks():
             assert np.abs(found - expected).max() <= 1e-9 * np.abs(expected).max()
 
 
-def test_restart_and_repartition(tmp_path):
+def test_restart_and_moves_to_other_ranks(tmp_path):
     path = WORLD.bcast(tmp_path / "run.ckpt")
     problem = beam(YIELDING, load=0.1)
     for step in problem.steps(4):

@@ -117,7 +117,7 @@ def test_clouds_of_boxes(mpi_tmp_path):
     same_run(*values, 1e-9)
 
 
-def test_checkpoints_do_not_mind(mpi_tmp_path):
+def test_checkpoints_do_not_mind_where_ranks_are(mpi_tmp_path):
     path = mpi_tmp_path / "column.ckpt"
     problem = flowing("background")
     for step in problem.steps(4, repartition=0.0):
