@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Backgrounds and domains of degree 1 to 3: order, rank, patch test, folding, output, ranks."""
 
+import functools
+
 from mpi4py import MPI
 
 import numpy as np
@@ -55,6 +57,10 @@ def column(case, ne, cell, degree, domain_degree=None, steps=40, material=None, 
     return problem
 
 
+#: Columns that several tests look at.
+solved = functools.cache(column)
+
+
 def errors(problem, case):
     """Return the errors of stress at the points and of the nodes' positions."""
     particles = problem.particles
@@ -81,7 +87,7 @@ def errors(problem, case):
 )
 def test_order(degree, cell):
     sizes = (8, 16)
-    found = np.array([errors(column(A, ne, cell, degree), A) for ne in sizes])
+    found = np.array([errors(solved(A, ne, cell, degree), A) for ne in sizes])
     orders = np.log2(found[0] / found[1])
     assert orders[0] > degree + 0.2
     assert orders[1] > degree + 0.7
@@ -96,7 +102,7 @@ def test_order(degree, cell):
     ],
 )
 def test_column(cell, degree, ne, bound):
-    problem = column(A, ne, cell, degree)
+    problem = solved(A, ne, cell, degree)
     up = problem.particles.mesh.geometry.dim - 1
     exact = A.stress(problem.particles.initial_centroid[:, up])[1]
     assert scenes.stress_error(problem, A, up, exact) < bound

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import scenes
-from marks import thinned
+from marks import slow, thinned
 from scenes import HEXAHEDRON, QUADRILATERAL, TETRAHEDRON, TRIANGLE, A, vectors
 from scipy.linalg import expm
 
@@ -281,7 +281,7 @@ def layered_errors(ne, cell, ratio=2.0, parameters="tags", case=A):
     return errors
 
 
-@pytest.mark.parametrize("parameters", ["tags", "functions"])
+@pytest.mark.parametrize("parameters", [*slow("tags"), "functions"])
 def test_a_layered_column(parameters):
     # The stretch jumps inside a cell of the background as soon as the layers' border has moved,
     # so the stress is off near it, and worse than in column A (2.57e-3 with 16 cells).
