@@ -35,10 +35,11 @@ def probe(particles: Particles, points: Any, field: str = "displacement") -> NDA
             ``"pore_pressure"`` of a :class:`PorousProblem`, all interpolated within the domain of
             a point; or a name in ``particles.fields()``, as ``"stress"``, ``"plastic_strain"``:
             the mean over the domain of the particle that has the point, the first of them
-            between several.
+            between several that are not deleted.
 
     Returns:
-        Values, shape ``(m, ...)``; of a single point without the first index.
+        Values, shape ``(m, ...)``; of a single point without the first index. NaN where the domain
+        of a point was deleted.
 
     Raises:
         MPMError: Points outside the body, a name that there is not, or a body that was rebased,
@@ -67,9 +68,13 @@ def probe(particles: Particles, points: Any, field: str = "displacement") -> NDA
 
 
 def _cells(particles: Particles, points: NDArray[np.float64]) -> NDArray[np.int32]:
-    """Return this rank's particle at points in space, -1 where it is another's (collective)."""
+    """Return this rank's particle at points in space, -1 where it is another's (collective).
+
+    Of several it is the first, of those that are deleted only where there is no other.
+    """
     mesh, comm = particles.mesh, particles.mesh.comm
     own = np.arange(particles.num_local, dtype=np.int32)
+    order = particles.global_index + particles.num_global * particles.deleted
     x = mesh.geometry.x
     ends = (x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf))
     low, high = np.swapaxes(comm.allgather(ends), 0, 1)
@@ -84,8 +89,8 @@ def _cells(particles: Particles, points: NDArray[np.float64]) -> NDArray[np.int3
         of = np.repeat(np.arange(len(points)), np.diff(offsets))
         squares = geometry.squared_distance(mesh, mesh.topology.dim, near, points[of])
         for point, cell in zip(of[squares <= slack**2], near[squares <= slack**2], strict=True):
-            if particles.global_index[cell] < names[point]:
-                names[point], cells[point] = particles.global_index[cell], cell
+            if order[cell] < names[point]:
+                names[point], cells[point] = order[cell], cell
     first = np.min(comm.allgather(names), axis=0)
     with agree(comm):
         if (first == none).any():
@@ -102,6 +107,7 @@ def _values(
 ) -> NDArray[np.float64]:
     """Return this rank's values at points in space, zeros at those of others."""
     mine, functions = cells >= 0, particles.functions()
+    gone = np.flatnonzero(mine)[particles.deleted[cells[mine]]]
     of = "displacement" if field == "position" else field
     if of in functions:
         shape = functions[of].ufl_shape
@@ -110,6 +116,7 @@ def _values(
             values[mine] = functions[of].eval(points[mine], cells[mine]).reshape(-1, *shape)
         if field == "position":
             values[mine] += points[mine, : particles.mesh.geometry.dim]
+        values[gone] = np.nan
         return values
     fields = particles.fields()
     if field not in fields:
@@ -117,4 +124,5 @@ def _values(
         raise MPMError(f"There is no field {field!r} of these particles; they have {names}.")
     values = np.zeros((len(points), *fields[field].shape[1:]))
     values[mine] = fields[field][cells[mine]]
+    values[gone] = np.nan
     return values

@@ -101,6 +101,34 @@ def test_the_pore_pressure_along_a_line():
     assert one.shape == () and np.allclose(one, p[np.argmin(abs(x[:, 1] - 0.5))])
 
 
+@pytest.mark.parametrize("low", [True, False])
+def test_the_edge_of_a_pit_is_ground_on_any_rank(low):
+    """The stress there is that of the ground that is left; what was dug away has none."""
+    V = scenes.vectors(scenes.box([0.0, 0.0], [4.0, 3.0], [8, 6], CELLS[2]))
+    ground = scenes.box([0.0, 0.0], [4.0, 2.0], [16, 8], CELLS[2])
+    particles = mpm.Particles(ground, V)
+    load, weight = (0.0, -1.0), 20.0
+    problem = mpm.QuasiStaticProblem(
+        mpm.Body(
+            particles,
+            mpm.materials.Hencky(1e6, 0.0),
+            density=weight,
+            body_force=load,
+            initial_stress=mpm.geostatic(2.0, weight, 0.0, load),
+        ),
+        bcs=[mpm.held(V, 0, x=0.0), mpm.held(V, 0, x=4.0), mpm.held(V, 1, y=0.0)],
+    )
+    problem.remove(mpm.region(y=(0.0, 1.0) if low else (1.0, 2.0)), name="pit")
+    points = [(0.6, 1.0), (1.25, 1.0), (3.9, 1.0)]
+    stress = mpm.probe(particles, points, "stress")[:, 1, 1]
+    own = weight * (0.875 if low else 1.125)  # in the middle of the row that is left
+    assert np.allclose(stress, -own, rtol=1e-6)
+    dug = (1.3, 0.4 if low else 1.6)
+    for field in ("stress", "displacement", "position"):
+        assert np.isnan(mpm.probe(particles, dug, field)).all()
+        assert np.isfinite(mpm.probe(particles, points, field)).all()
+
+
 def test_what_cannot_be_asked():
     particles, problem = bar()
     problem.solve(steps=1)
