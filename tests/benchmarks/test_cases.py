@@ -25,7 +25,7 @@ LONG = {
     *("gradient", "hertz-pair", "weight-recommended", "circle-recommended", "incline", "sand"),
     *("vortex", "disc", "discs", "discs-contact", "column"),
     *("dam-recommended", "embankment-stiff", "embankment-recommended"),
-    "indentation",
+    *("indentation", "cantilever"),
     *(
         "pipe",
         "mandel",
@@ -648,7 +648,7 @@ def test_column_goes_on_from_its_checkpoint(mpi_tmp_path, capfd, monkeypatch):
             "--elements 4 --steps 10",
             marks=[pytest.mark.skip_in_parallel, pytest.mark.slow],
         ),
-        ("column_roller", "--elements 8 --steps 10"),
+        pytest.param("column_roller", "--elements 8 --steps 10", marks=pytest.mark.slow),
         ("column_free", "--cell 1 --steps 10 --g0 10e3"),
         pytest.param(
             "ufl_material",

@@ -64,7 +64,8 @@ def freed(problem):
 @pytest.mark.parametrize(
     "cell, degree, tolerance",
     [
-        *((QUADRILATERAL, 1, 0.18), (QUADRILATERAL, 2, 0.1), (TRIANGLE, 1, 0.25)),
+        *((QUADRILATERAL, 2, 0.1), (TRIANGLE, 1, 0.25)),
+        pytest.param(QUADRILATERAL, 1, 0.18, marks=pytest.mark.slow),
         pytest.param(HEXAHEDRON, 1, 0.35, marks=pytest.mark.slow),
     ],
     ids=str,
@@ -245,7 +246,7 @@ def test_steps_chosen_by_their_error_and_levels():
     assert [step.load for step in problem.history.steps if step.output] == [0.5, 1.0]
     assert problem.error() <= 0.15 and sum(freed(problem)) > 0
     equal, other = strip([])
-    equal.solve(16, adapt=0.15)
+    equal.solve(10, adapt=0.15)
     ends = [p.reaction(s)[1] for p, s in ((problem, under), (equal, other))]
     assert ends[0] == pytest.approx(ends[1], rel=0.02)
 
