@@ -30,7 +30,7 @@ from .outlines import (
     surface_algorithm,
 )
 
-__all__ = ["Shot", "draw", "framed", "new_figure", "scene", "take"]
+__all__ = ["Shot", "directions", "draw", "framed", "new_figure", "scene", "take"]
 
 #: Room around the bodies, relative to their extent; size of a background over theirs up to which it
 #: is shown whole; pixels of the longer side in space.
@@ -278,7 +278,7 @@ def new_figure(figures: Any, shot: Shot, look: Look) -> Any:
     """Return an empty figure whose shape suits what is shown."""
     box = framed(shot.extent, shot.around) if look.box is None else look.box
     if len(box[0]) == 3:
-        right, up, _ = _axes(look)
+        right, up, _ = directions(look)
         wide, high = np.abs(right) @ (box[1] - box[0]), np.abs(up) @ (box[1] - box[0])
     else:
         wide, high = np.maximum(box[1] - box[0], 1e-12)
@@ -286,7 +286,7 @@ def new_figure(figures: Any, shot: Shot, look: Look) -> Any:
     return figures.Figure(figsize=(8.0, float(height)), layout="compressed")
 
 
-def _axes(look: Look) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def directions(look: Look) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return unit vectors to the right and upwards in a picture in space, and into it."""
     pyvista = import_module("pyvista")
     with _quiet():
@@ -429,7 +429,7 @@ def _rendered(shot: Shot, look: Look, limits: tuple[float, float]) -> NDArray[np
     count = sum(grid.n_cells for grid in shot.bodies)
     lines = count < 60000 if look.lines is None else look.lines
     box = framed(shot.extent, shot.around) if look.box is None else look.box
-    right, up, into = _axes(look)
+    right, up, into = directions(look)
     size, middle = box[1] - box[0], box.mean(axis=0)
     wide, high = np.abs(right) @ size, np.abs(up) @ size
     pixels = [max(1, round(PIXELS * side / max(wide, high))) for side in (wide, high)]

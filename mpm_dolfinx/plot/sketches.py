@@ -24,7 +24,7 @@ from ..particles.particles import Particles
 from .fields import bodies_of
 from .looks import Look, corners
 from .outlines import imported, require_axes
-from .scenes import OBSTACLE, STRUCTURE, Shot, draw, framed, new_figure, take
+from .scenes import OBSTACLE, STRUCTURE, Shot, directions, draw, framed, new_figure, take
 
 __all__ = ["sketch"]
 
@@ -72,6 +72,11 @@ class _Marks:
         """One point of each place, shape ``(m, gdim)``."""
         return np.asarray(self.parts.mean(axis=1))
 
+    def within(self, box: Array) -> _Marks:
+        """Return those in a box."""
+        there = ((self.points >= box[0]) & (self.points <= box[1])).all(axis=1)
+        return _Marks(self.kind, self.parts[there], self.directions[there])
+
     def some(self) -> _Marks:
         """Return a part of them that can be told from each other in a picture."""
         order = np.lexsort(self.points.round(9).T)[:: -(-len(self.parts) // MOST) or 1]
@@ -86,7 +91,7 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
     is held (a triangle points along the component, a square holds all), supports and loads on
     facets, boundaries that are drained, rigid obstacles and a water table. Arrows show what
     displacements and loads have a value now; of UFL there are the facets alone. In space all but
-    bodies and obstacles are points.
+    bodies and obstacles are points, and the legend has the extent of the bodies.
 
     Args:
         problem: A problem.
@@ -125,6 +130,8 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
         limits = (-0.5, len(colours) - 0.5)
         if shown is None and gdim == 2:
             shown = framed(shot.extent, shot.around, whole=True)
+        if gdim == 2:
+            marks = [part for part in (one.within(shown) for one in marks) if len(part.parts)]
         look = Look("", cmap, limits, box=shown)
         if gdim == 3:
             shot = _with_points(shot, marks, len(names))
@@ -141,6 +148,8 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
                 level = np.broadcast_to(water.level_at(np.array([x, 0.0 * x])), x.shape)
                 where.plot(x, level, "--", color=COLOURS["drained"], linewidth=1.2)
             where.set(xlabel="x", ylabel="y")
+        else:
+            _point(where, directions(look))
         _explain(where, names, marks, shot, given)
         if path is not None:
             figure.savefig(path, dpi=160, bbox_inches="tight")
@@ -315,6 +324,17 @@ def _draw(marks: _Marks, ax: Any, middle: Array, size: float) -> None:
     )
 
 
+def _point(ax: Any, towards: tuple[Array, Array, Array]) -> None:
+    """Draw where x, y and z go in a picture in space."""
+    right, up, _ = towards
+    corner = ax.inset_axes((1.02, 0.0, 0.2, 0.3))
+    corner.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
+    corner.set_axis_off()
+    for name, x, y in zip("xyz", right, up, strict=True):
+        corner.annotate("", (x, y), (0.0, 0.0), arrowprops={"arrowstyle": "->"})
+        corner.text(1.25 * x, 1.25 * y, name, ha="center", va="center")
+
+
 def _explain(
     ax: Any, names: Sequence[str], marks: Sequence[_Marks], shot: Shot, given: Sequence[Any]
 ) -> None:
@@ -343,4 +363,10 @@ def _explain(
             words = ", ".join(f"{value:g}" for value in known)
             handles.append(line([], [], linestyle="", label=f"body force ({words})"))
             break
+    if shot.extent.shape[1] == 3:
+        points = np.concatenate([body.points for body in shot.bodies])
+        size = np.ptp(points, axis=0).max() or 1.0
+        ends = np.round([points.min(axis=0) / size, points.max(axis=0) / size], 6) * size + 0.0
+        for name, (low, high) in zip("xyz", ends.T, strict=True):
+            handles.append(line([], [], linestyle="", label=f"{name} from {low:.3g} to {high:.3g}"))
     ax.legend(handles=handles, loc="upper left", bbox_to_anchor=(1.01, 1.0), frameon=False)

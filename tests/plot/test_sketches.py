@@ -175,7 +175,18 @@ def test_in_space_conditions_are_points():
     )
     figure = mpm.plot.sketch(mpm.QuasiStaticProblem(given, [mpm.held(V, z=0.0)]))
     if WORLD.rank == 0:
-        assert words(figure) == ["Hencky", "held", "held, not reached", "traction"]
+        assert words(figure)[:4] == ["Hencky", "held", "held, not reached", "traction"]
+        assert words(figure)[4:] == [f"{axis} from 0 to 1" for axis in "xyz"]
+        (corner,) = figure.axes[0].child_axes
+        along = {text.get_text(): np.array(text.get_position()) for text in corner.texts}
+        assert along["z"][1] > 0.0 and abs(along["z"][0]) < 1e-6  # upright, x to the right
+        assert along["x"][0] > 0.0 and along["y"][0] > 0.0 and along["y"][1] > 0.0
+
+
+def test_the_legend_tells_what_is_in_the_picture():
+    figure = mpm.plot.sketch(ground(), box=[[1.0, 1.0], [5.0, 3.5]])
+    if WORLD.rank == 0:
+        assert words(figure)[2:] == ["traction"]
 
 
 def test_what_is_no_problem_is_told():
