@@ -476,7 +476,7 @@ def panel(ax: Any, rows: list[dict[str, Any]], case: str, key: str) -> None:
             if name.startswith("AMPLE") and "point" not in name:
                 faster = [(seconds / MATLAB, error) for seconds, error in points]
                 ax.loglog(*zip(*faster, strict=True), ":", color=GREY, lw=1.5, zorder=1)
-                names.append(("the same in MATLAB, estimated", faster, GREY))
+                names.append(("in MATLAB, estimated", faster, GREY))
     for name, kind in KINDS.items():
         points = [(row[key], row["error"]) for row in curve(rows, case, name)]
         if points:
@@ -486,14 +486,16 @@ def panel(ax: Any, rows: list[dict[str, Any]], case: str, key: str) -> None:
     ax.set_title(f"{TITLES[case]}\n")
     ax.text(0.0, 1.02, ERRORS[case], transform=ax.transAxes, color="0.3")
     ax.grid(which="major", color="0.92")
+    if key == "process":
+        ax.set_xlim(left=0.25)
     label(ax, names)
     left, right = ax.get_xlim()
-    if key == "process":
-        left = 0.25
-        ax.set_xlim(left, right)
-    ticks = [b * 10.0**a for a in range(-2, 5) for b in ((1, 2, 5) if right < 200 * left else (1,))]
-    ax.set_xticks([t for t in ticks if left <= t <= right])
-    ax.set_xticklabels([f"{t:g}" for t in ticks if left <= t <= right])
+    ticks = marked(left, right)
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    bottom, top = ax.get_ylim()
+    if top < 200 * bottom:
+        ticks = marked(bottom, top)
+        ax.set_yticks(ticks, [f"{t:g}" for t in ticks])
     ax.minorticks_off()
     if case in UNSURE:
         ax.axhspan(ax.get_ylim()[0], UNSURE[case], color="0.95", zorder=0)
@@ -515,6 +517,13 @@ def panel(ax: Any, rows: list[dict[str, Any]], case: str, key: str) -> None:
         ax.text(*at, "start-up", rotation=90, ha="center", va="center", color=GREY, fontsize=11)
 
 
+def marked(low: float, high: float) -> list[float]:
+    """Return the round numbers between two at which a logarithmic axis has ticks."""
+    digits = range(1, 10) if high < 6 * low else (1, 2, 5) if high < 200 * low else (1,)
+    ticks = [float(f"{digit}e{power}") for power in range(-9, 5) for digit in digits]
+    return [tick for tick in ticks if low <= tick <= high]
+
+
 def label(ax: Any, names: list[tuple[str, list[tuple[float, float]], str]]) -> None:
     """Write each name beside its curve where it covers no point and no other name."""
     import numpy as np
@@ -523,61 +532,66 @@ def label(ax: Any, names: list[tuple[str, list[tuple[float, float]], str]]) -> N
     bottom, top = ax.get_ylim()
     ax.set_xlim(left, right * (right / left) ** 0.1)
     ax.set_ylim(bottom / (top / bottom) ** 0.05, top * (top / bottom) ** 0.06)
-    fig = ax.figure
-    fig.canvas.draw()
-    renderer = fig.canvas.get_renderer()
+    ax.figure.canvas.draw()
+    renderer = ax.figure.canvas.get_renderer()
     place = ax.transData.transform
     fine = np.linspace(0.0, 1.0, 60)[:, None]
-    drawn = []
-    for _, points, _ in names:
-        xy = place(np.array(points))
-        drawn.append(np.vstack([a + fine * (b - a) for a, b in pairwise(xy)] or [xy]))
-    everything = np.vstack(drawn)
-    frame, taken = ax.get_window_extent(renderer), []
-    aligned = {-1: "right", 0: "center", 1: "left"}
-    vertical = {-1: "top", 0: "center", 1: "bottom"}
-    for text, points, colour in names:
-        best = None
-        for index, xy in enumerate(place(np.array(points))):
-            for reach in (1.0, 2.0, 3.0):
-                for dx, dy in (
-                    (1, 0),
-                    (1, 1),
-                    (1, -1),
-                    (0, 1),
-                    (0, -1),
-                    (-1, -1),
-                    (-1, 1),
-                    (-1, 0),
-                ):
-                    at = xy + reach * np.array([dx * 11.0, dy * 11.0])
-                    mark = ax.annotate(
-                        text,
-                        ax.transData.inverted().transform(at),
-                        ha=aligned[dx],
-                        va=vertical[dy],
-                        color=colour,
-                        fontsize=12,
-                    )
-                    box = mark.get_window_extent(renderer)
-                    inside = (
-                        (everything[:, 0] > box.x0 - 3)
-                        & (everything[:, 0] < box.x1 + 3)
-                        & (everything[:, 1] > box.y0 - 2)
-                        & (everything[:, 1] < box.y1 + 2)
-                    ).sum()
-                    crossed = sum(100 for other in taken if box.padded(6).overlaps(other))
-                    beyond = box.x1 > frame.x1 + 20 or box.x0 < frame.x0 or box.y0 < frame.y0
-                    beyond |= box.y1 > frame.y1
-                    cost = inside + crossed + 500 * beyond + 2 * reach - 0.5 * index
-                    if best is None or cost < best[0]:
-                        if best is not None:
-                            best[1].remove()
-                        best = (cost, mark, box)
-                    else:
-                        mark.remove()
-        if best is not None:
-            taken.append(best[2])
+    corners = [place(np.array(points)) for _, points, _ in names]
+    drawn = np.vstack([*corners, *(a + fine * (b - a) for xy in corners for a, b in pairwise(xy))])
+    frame = ax.get_window_extent(renderer)
+    towards = np.array([(1, 0), (1, 1), (1, -1), (0, 1), (0, -1), (-1, -1), (-1, 1), (-1, 0)])
+
+    def covered(low: Any, high: Any, points: Any, near: float) -> Any:
+        within = (points > low[:, None] - near) & (points < high[:, None] + near)
+        return within.all(axis=2).sum(axis=1)
+
+    boxes, costs = [], []
+    for number, (text, _, _) in enumerate(names):
+        mark = ax.text(left, bottom, text, fontsize=12)
+        size = np.array(mark.get_window_extent(renderer).size)
+        mark.remove()
+        index, reach, way = (
+            part.ravel() for part in np.indices((len(corners[number]), 4, len(towards)))
+        )
+        at = corners[number][index] + 11.0 * (reach + 1)[:, None] * towards[way]
+        low = at - 0.5 * (1 - towards[way]) * size
+        high = low + size
+        cost = 2 * covered(low, high, drawn, 3) + 3.0 * reach - 0.5 * index
+        for other, points in enumerate(corners):
+            cost += 50 * covered(low, high, points, 5)
+            cost += 0 if other == number else 20 * covered(low, high, points, 14)
+        beyond = (low[:, 0] < frame.x0) | (high[:, 0] > frame.x1 + 20)
+        beyond |= (low[:, 1] < frame.y0) | (high[:, 1] > frame.y1)
+        boxes.append((low, high, corners[number][index]))
+        costs.append(cost + 500 * beyond)
+    crossing = {}  # whether a place of one name is too near to one of another
+    for one, (low, high, _) in enumerate(boxes):
+        for other, (first, last, _) in enumerate(boxes):
+            if other != one:
+                near = (low[:, None] < last + 6) & (high[:, None] > first - 6)
+                crossing[one, other] = 100.0 * near.all(axis=2)
+    found = (np.inf, [])
+    random = np.random.default_rng(0)
+    for _ in range(100):
+        chosen = [int(np.argmin(cost)) for cost in costs]
+        for one in [k for _ in range(4) for k in random.permutation(len(names))]:
+            others = (crossing[one, k][:, chosen[k]] for k in range(len(names)) if k != one)
+            chosen[one] = int(np.argmin(costs[one] + sum(others)))
+        total = sum(cost[k] for cost, k in zip(costs, chosen, strict=True))
+        total += sum(near[chosen[one], chosen[other]] for (one, other), near in crossing.items())
+        found = min(found, (total, chosen))
+    chosen = found[1]
+    for (text, _, colour), (low, high, of), best in zip(names, boxes, chosen, strict=True):
+        ax.annotate(
+            text,
+            ax.transData.inverted().transform(of[best]),
+            0.5 * (low[best] + high[best]) - of[best],
+            textcoords="offset pixels",
+            ha="center",
+            va="center",
+            color=colour,
+            fontsize=12,
+        )
 
 
 # ## Command line
