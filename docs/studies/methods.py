@@ -17,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from case_runs import Table, run, scientific
 from matplotlib.collections import PolyCollection
+from matplotlib.patheffects import withStroke
 from PIL import Image
 
 from dolfinx import fem, mesh
@@ -205,18 +206,22 @@ def picture() -> None:
         w = particles.weights()
         part = slice(w.offsets[centre], w.offsets[centre + 1])
         nodes = V.tabulate_dof_coordinates()[w.nodes[part], :2]
-        ax.scatter(*nodes.T, s=30 + 1100 * w.S[part], color=BLUE, alpha=0.75, zorder=2, lw=0)
-        for node, value in zip(nodes, w.S[part], strict=True):
+        sizes = 30 + 1100 * w.S[part]
+        ax.scatter(*nodes.T, s=sizes, color=BLUE, alpha=0.75, zorder=2, lw=0)
+        for node, value, size in zip(nodes, w.S[part], sizes, strict=True):
             if value < 0.005:
                 continue
+            beyond = 0.4 * size**0.5  # of the disc, half its diameter to the right and down
             ax.annotate(
                 f"{value:.2f}",
                 node,
-                xytext=(5, -15),
+                xytext=(beyond + 1, -beyond - 1),
                 textcoords="offset points",
+                va="top",
                 color=BLUE,
                 size=12,
                 zorder=5,
+                path_effects=[withStroke(linewidth=3, foreground="w")],
             )
         what = {"mpm": "a point", "gimp": "boxes", "cpdi": "parallelograms"}
         ax.set_title(f"{name}: {what.get(method, 'connected corners')}", loc="left", size=14)
