@@ -34,7 +34,7 @@ __all__ = ["Shot", "directions", "draw", "framed", "new_figure", "scene", "take"
 
 #: Room around the bodies, relative to their extent; size of a background over theirs up to which it
 #: is shown whole; pixels of the longer side in space.
-MARGIN, NEARBY, PIXELS = 0.04, 2.0, 1500
+MARGIN, NEARBY, PIXELS = 0.04, 3.0, 1500
 #: Colour of obstacles.
 OBSTACLE = "#b9b2a6"
 #: Colour of structures without a field, and their width in points and in pixels of space. In
