@@ -137,6 +137,7 @@ figure, axes = plt.subplot_mosaic(
 look = {"cmap": "YlOrBr", "limits": (0.0, 0.01), "background": False}
 mpm.plot.scene(held, "plastic_strain", ax=axes["scene"], **look)
 axes["scene"].plot(*supported[-1][3].position.T, color="steelblue", linewidth=4)
+axes["scene"].set(xlabel="x, m", ylabel="y, m")
 for name, rows, title in (("free", cantilever, "free"), ("held", supported, "anchored")):
     ax = axes[name]
     for depth, _, _, found in rows:

@@ -94,7 +94,7 @@ mpm.plot.domains(
     moving.particles, moving.particles.plastic_strain, ax=left, cmap="YlGnBu", vmin=0.0
 )
 left.set(xlim=(0, 14), ylim=(0, 8.2), xlabel="x, m", ylabel="y, m")
-left.set_title("After 2 s; orange: in equilibrium")
+left.set_title("Plastic strain after 2 s; orange: in equilibrium")
 for name, label in kinds.items():
     right.plot(times, [getattr(energy, name) / 1e3 for energy in energies], label=label)
 right.set(xlabel="time, s", ylabel="kJ/m")

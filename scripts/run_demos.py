@@ -48,6 +48,9 @@ def keep_card(name: str) -> None:
             figure.canvas.draw()
             *_, chosen = sorted(figure.axes, key=weight)
             panel = chosen.get_window_extent().transformed(figure.dpi_scale_trans.inverted())
+            legend = chosen.get_legend()
+            if legend is not None:  # too small to be read there
+                legend.set_visible(False)
             save(figure, f"{name}_card.png", bbox_inches=panel, dpi=200)
 
     Figure.savefig = both
@@ -113,7 +116,7 @@ def run(name: str, model: bool) -> None:
             image = Image.open(made).convert("RGB")
             if made.name.endswith("_card.png"):
                 image.thumbnail((480, 300))
-            image.quantize(64).save(made, optimize=True)
+            image.quantize(256).save(made, optimize=True)
         if not model:
             (KEPT / f"{name}.txt").write_text(done.stdout, "utf-8")
         print(f"{name}: {time.perf_counter() - begin:.1f} s", flush=True)
