@@ -175,7 +175,7 @@ for (const kind of ["error", "warn"]) {
 }
 </script>"""
 
-#: Loads each page into a frame of a reader's width, looks at it, and reports.
+#: Loads each page into a frame of a reader's width, then of a phone's, looks at it, and reports.
 LOOKING = """<!doctype html><title>check</title><body style="margin:0"><script>
 async function look(name) {
   const frame = document.createElement("iframe");
@@ -211,6 +211,14 @@ async function look(name) {
   const items = [...page.querySelectorAll("article p")].filter(
     p => /\\n[-*] \\S/.test(p.textContent)).length;
   if (items) wrong.push("a list that is none");
+  frame.style.width = "390px";  // a phone
+  await new Promise(done => frame.contentWindow.requestAnimationFrame(done));
+  if (page.documentElement.scrollWidth > frame.clientWidth + 1) wrong.push("wider than a phone");
+  for (const number of page.querySelectorAll(".equation-number")) {
+    const math = number.parentElement.querySelector("math").getBoundingClientRect();
+    if (number.getBoundingClientRect().left < math.right || math.left < 0)
+      wrong.push("formula under its number, or cut off: " + number.textContent);
+  }
   return {name, wrong, formulas, long};
 }
 (async () => {
