@@ -101,12 +101,12 @@ for name in ("carried", "adapt=0.08"):
     x = comm.gather(body.node_positions[: len(free)][free, :2])
     if comm.rank == 0:
         axes[name].plot(*np.concatenate(x).T, "o", ms=4, mfc="none", color="#d62728")
-        axes[name].set(xlim=(0.5, 1.5), ylim=(0.5, 1.5), title=f"{name}: {runs[name][2]:.0%}")
+        axes[name].set(xlim=(0.5, 1.5), ylim=(0.5, 1.5), title=f"{name}: {runs[name][2]:.1%}")
 if comm.rank == 0:
     names = [f"{name}\n{run[1]} unknowns" for name, run in runs.items()]
     axes["cost"].barh(names, list(found.values()), color="C0", label="error")
     axes["cost"].plot([run[2] for run in runs.values()], names, "kd", label="estimate")
-    axes["cost"].invert_yaxis()
+    axes["cost"].set(xlabel="error in energy, relative", ylim=(3.5, -0.5))
     axes["cost"].legend()
     fig.savefig("bracket.png", dpi=130)
 
