@@ -128,9 +128,8 @@ def sketch(problem: Any, path: str | Path | None = None, *, ax: Any = None, box:
         colours = [*(TINTS[k % len(TINTS)] for k in range(len(names))), *COLOURS.values()]
         cmap = import_module("matplotlib.colors").ListedColormap(colours)
         limits = (-0.5, len(colours) - 0.5)
-        if shown is None and gdim == 2:
-            shown = framed(shot.extent, shot.around, whole=True)
         if gdim == 2:
+            shown = framed(shot.extent, shot.around, whole=True) if shown is None else shown
             marks = [part for part in (one.within(shown) for one in marks) if len(part.parts)]
         look = Look("", cmap, limits, box=shown)
         if gdim == 3:
