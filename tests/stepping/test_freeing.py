@@ -87,7 +87,7 @@ def test_a_run_goes_on_where_finite_elements_end(cell):
     assert reaction == pytest.approx(weight, rel=1e-8)
 
 
-@pytest.mark.parametrize("law", [RUBBER, CLAY], ids=["rubber", "clay"])
+@pytest.mark.parametrize("law", [*slow(RUBBER), CLAY], ids=["rubber", "clay"])
 def test_nothing_jumps_where_nodes_are_carried(law):
     problem, own = column(law=law)
     counts, heights, shares = [], [4.0], []
