@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, Literal
 
 from petsc4py import PETSc
@@ -297,15 +298,20 @@ class CarriedField:
             points = _undeformed_points(body) if self.is_frozen else body.placement.points()
             return points.reshape(-1, gdim)
         if self.is_frozen:
-            x = node_positions(self.W)
+            x = self._undeformed
         else:
             x = self.converged_nodes()
         return np.asarray(x[: self.W.dofmap.index_map.size_local])
 
+    @cached_property
+    def _undeformed(self) -> NDArray[np.float64]:
+        """Undeformed positions of the local nodes of W, shape ``(N, gdim)``."""
+        return node_positions(self.W)
+
     def converged_nodes(self) -> NDArray[np.float64]:
         """Return the positions of a field's nodes, last converged, ``(N, gdim)`` (collective)."""
-        x = node_positions(self.W)
-        return np.asarray(x + self._at_nodes(self.field.particles.converged_displacement))
+        moved = self._at_nodes(self.field.particles.converged_displacement)
+        return np.asarray(self._undeformed + moved)
 
     def _at_nodes(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a motion of the body's nodes at those of the field, ``(N, gdim)`` (collective)."""
