@@ -147,7 +147,7 @@ def test_cells_that_do_not_soften_have_no_part_in_the_average():
     np.testing.assert_allclose(found[soft], 0.07, rtol=1e-8)
 
 
-def test_a_finer_mesh_changes_next_to_nothing():
+def test_finer_cells_change_next_to_nothing():
     coarse, fine = (run(bar(cells), 12) for cells in (32, 64))
     assert abs(np.trapezoid(*fine[::-1]) / np.trapezoid(*coarse[::-1]) - 1.0) < 0.02
 
