@@ -297,21 +297,15 @@ class CarriedField:
         if self.field.at == "points":
             points = _undeformed_points(body) if self.is_frozen else body.placement.points()
             return points.reshape(-1, gdim)
-        if self.is_frozen:
-            x = self._undeformed
-        else:
-            x = self.converged_nodes()
-        return np.asarray(x[: self.W.dofmap.index_map.size_local])
+        x = self._undeformed
+        if not self.is_frozen:
+            x = x + self._at_nodes(body.converged_displacement)
+        return x[: self.W.dofmap.index_map.size_local]
 
     @cached_property
     def _undeformed(self) -> NDArray[np.float64]:
         """Undeformed positions of the local nodes of W, shape ``(N, gdim)``."""
         return node_positions(self.W)
-
-    def converged_nodes(self) -> NDArray[np.float64]:
-        """Return the positions of a field's nodes, last converged, ``(N, gdim)`` (collective)."""
-        moved = self._at_nodes(self.field.particles.converged_displacement)
-        return np.asarray(self._undeformed + moved)
 
     def _at_nodes(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a motion of the body's nodes at those of the field, ``(N, gdim)`` (collective)."""
