@@ -92,7 +92,7 @@ def test_an_equal_law_changes_nothing(name, way, half):
             staged(problem, material={1: law, 2: other} if half else other)
             np.testing.assert_allclose(body.stress, before[0], atol=1e-9)
             np.testing.assert_array_equal(body.plastic_strain, before[1])
-        body.load.value = 1.05
+        body.load.value = 1.02  # (sand with a pressure of its own bears 1.032)
         problem.step()
         ends.append((body.displacement.x.array, body.stress))
     for tolerance, end in zip((1e-12, 1e-10), ends[1:], strict=False):
