@@ -20,7 +20,6 @@ from dolfinx import fem, la, mesh
 from .. import _compat
 from ..assembly.petsc import create_vector, with_entries_at
 from ..errors import MPMError
-from ..meshes.nodes import node_positions
 from ..meshes.remesh import Column
 from ..meshes.tags import require_on_boundary
 from ..parallel.given import require_truth
@@ -235,7 +234,7 @@ class Surface:
             return False
         self._space = W
         cells, facets = self._where.settle()
-        x = node_positions(W)
+        x = self.particles.geometry.nodes
         nodes = np.zeros((len(cells), self.element.dim), dtype=np.int64)
         for side, own in enumerate(self._nodes):
             here = facets == side

@@ -157,7 +157,7 @@ class DisplacementControl:
         """
         particles = self.particles
         ring = particles.domain_nodes[particles.geometry.triangular][:, RING]
-        x = particles.W.tabulate_dof_coordinates()[:, : len(self._point)]
+        x = particles.geometry.nodes
         edges = np.linalg.norm(x[ring] - x[np.roll(ring, 1, axis=1)], axis=2)
         kept = (edges.argmin(axis=1)[:, None] + np.arange(1, 4)) % 4
         nodes = np.take_along_axis(ring, kept, axis=1)
